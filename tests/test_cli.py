@@ -264,10 +264,8 @@ def test_what_follows_an_option_is_no_override(turbogs, capture, tmp_path):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        ("compare --out OUT", ["compare needs RUN"]),
-        ("compare a b --out OUT --psnr -5", ["--psnr -5"]),
-        ("compare a b --out OUT --psnr 20 nan", ["--psnr 20.0 nan"]),
-        ("ablate components --scene a --out OUT --psnr inf", ["--psnr inf"]),
+        ("report a b --out OUT --psnr -5", ["--psnr -5"]),
+        ("report a b --out OUT --psnr 20 nan", ["--psnr 20.0 nan"]),
         ("bench step --photos 3 --size 0 48", ["--size 0 48"]),
         ("bench step --photos 3 --size -5 48", ["--size -5 48"]),
         ("bench step --photos 3 --pixel-budget -1", ["--pixel-budget -1"]),
@@ -293,9 +291,6 @@ def test_incomplete_and_contradictory_calls(turbogs, capture, tmp_path):
     for call in (["train", "--out", tmp_path / "run", change], ["train", change, "--out", tmp_path / "run"]):
         assert_refused(turbogs(*call), f"train needs a SCENE: '{change}' is a change of a setting")
     assert_refused(turbogs("plan", change), "plan needs a SCENE")
-    for option, value in (("--steps", "0"), ("--time-budget", "nonsense"), ("--within", "soon")):
-        call = ("ablate", "components", "--scene", capture, "--out", tmp_path / "study", option, value)
-        assert_refused(turbogs(*call), f"error: {option} ", value)
     assert not list(tmp_path.iterdir())
     assert_refused(turbogs("train", capture, "--resume", tmp_path), "nothing else")
     assert_refused(turbogs("train", "--resume", tmp_path, "--device", "cpu"), "nothing else")
@@ -306,7 +301,7 @@ def test_an_empty_path_is_not_the_current_folder(turbogs, copy, tmp_path, monkey
     before = tree(tmp_path)
     said = "an argument is '': write a value, as . for the current folder, or leave it out"
     assert_refused(turbogs("train", "", "--out", tmp_path / "run", "--device", "cpu", *QUICK), said)
-    for verb in ("plan", "eval", "render", "export", "view", "demo", "compare"):
+    for verb in ("plan", "eval", "render", "export", "view", "demo", "report"):
         assert_refused(turbogs(verb, ""), said)
     assert_refused(turbogs("reconstruct", "", "--out", tmp_path / "cameras"), said)
     for option in (("--out", ""), ("--out=",)):

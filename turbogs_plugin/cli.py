@@ -26,7 +26,6 @@ COMMANDS = {
     "render": models.render,
     "export": models.export,
     "ablate": studies.ablate,
-    "compare": studies.compare,
     "report": studies.report,
     "bench": machine.bench,
     "demo": captures.demo,

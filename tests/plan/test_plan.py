@@ -18,7 +18,7 @@ from turbogs_plugin.plan.decisions import RULES
 from turbogs_plugin.plan.plan import plan_from_facts
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.study.folder import StudyFolder
+from turbogs_plugin.study.results import StudyFolder
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer
 
@@ -375,11 +375,11 @@ def test_the_ablation_of_leave_outs_plans_each_cell(turbogs, capture, tmp_path):
     code, _, err = turbogs("ablate", "leave_out", "train.evaluate_at=[]", *options, "--only", *variants)
     assert code == 0, err
     cells = {cell.variant: cell for cell in StudyFolder(tmp_path / "study").read_study().results}
-    measures = ("psnr", "worst_psnr", "ssim", "l1", "num_gaussians")
-    final = {name: [getattr(cell.final, measure) for measure in measures] for name, cell in cells.items()}
+    measures = ("psnr", "worst_psnr", "ssim", "l1", "gaussians")
+    final = {name: [cell.final.get(measure) for measure in measures] for name, cell in cells.items()}
     assert set(final) == {"nothing", *variants}
     assert final["host-maps"] == final["host-photos"] == final["nothing"]
     assert len({final[name][0] for name in ("nothing", "all-views", "no-ncc")}) == 3
     cell = cells["nothing"]
-    assert cell.config["train"]["maps_place"] == "device" and cell.config["optimizer"] == cell.asked["optimizer"]
-    assert cell.asked["train"]["maps_place"] == "auto", "what was asked for is kept, so that a call can go on"
+    assert cell.planned["train.maps_place"] == "device" and not [key for key in cell.planned if "optimizer" in key]
+    assert cell.settings["train.maps_place"] == "auto", "what was asked for is kept, so that a call can go on"

@@ -6,9 +6,7 @@ import pytest
 from turbogs_plugin.reconstruct.agreement import (
     Agreement,
     consistent_groups,
-    fewest_links,
     ghost_pairs,
-    linked_groups,
 )
 from turbogs_plugin.reconstruct.solver import epipolar_distances
 
@@ -66,21 +64,6 @@ def test_doubt_names_what_the_majority_does_not():
     assert consistent_groups(agreement, doubt=2.0) == [[0, 1], [2]]
 
 
-@pytest.mark.parametrize(("matches", "held"), [(12, False), (29, False), (30, True)])
-def test_photos_that_few_matches_hold_are_named(matches, held):
-    pairs = walk(8, 3).pairs
-    few = np.where((pairs == 7).any(axis=1), matches, 200)
-    few[(pairs < 2).all(axis=1)] = 900  # of one pair, which the median does not follow
-    agreement = Agreement(walk(8, 3).names, pairs, few, 0 * few)
-    assert fewest_links(agreement) == 30
-    assert linked_groups(agreement) == ([list(range(8))] if held else [list(range(7)), [7]])
-
-
-def test_few_matches_hold_nothing_however_few_there_are():
-    pair = Agreement(("a", "b"), np.array([[0, 1]]), np.array([29]), np.array([0]))
-    assert linked_groups(pair) == [[0], [1]]
-
-
 def test_many_weak_pairs_of_a_large_capture_do_not_outweigh_the_strong_ones():
     agreement = walk(300, 8, range(40), repeated=20)
     assert [len(group) for group in consistent_groups(agreement)] == [260, 40]
@@ -102,7 +85,7 @@ def test_parts_that_weak_pairs_alone_connect_are_together_if_these_agree():
 def test_no_pairs_leave_each_photo_alone():
     none = np.zeros(0, dtype=np.int64)
     alone = Agreement(("a", "b"), none.reshape(0, 2), none, none)
-    assert consistent_groups(alone) == linked_groups(alone) == [[0], [1]]
+    assert consistent_groups(alone) == [[0], [1]]
 
 
 def test_epipolar_distances_are_zero_for_points_and_not_for_others():

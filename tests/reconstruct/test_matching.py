@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from turbogs_plugin.reconstruct import matching
-from turbogs_plugin.reconstruct.matching import are_ordered, choose_matching, metres_of, natural_order, sequential_pairs
+from turbogs_plugin.reconstruct.matching import are_ordered, choose_pairs, metres_of, natural_order
 
 FILM = [f"frame_{number:05d}.jpg" for number in range(0, 1000, 2)]
 HASHES = [f"{number * 2654435761 % 2**32:08x}.jpg" for number in range(500)]
@@ -27,58 +27,54 @@ def assert_proper(pairs: np.ndarray, count: int) -> None:
 
 @pytest.mark.parametrize("count", [3, matching.FEW])
 def test_few_photos_are_matched_each_with_each(count):
-    chosen = choose_matching(HASHES[:count], flight(count, 500.0))
-    assert_proper(chosen.pairs, count)
-    assert (len(chosen.pairs), chosen.similar) == (count * (count - 1) // 2, 0) and "each with each" in chosen.reason
+    pairs, reason = choose_pairs(HASHES[:count], flight(count, 500.0))
+    assert_proper(pairs, count)
+    assert len(pairs) == count * (count - 1) // 2 and "each with each" in reason
 
 
-def test_ordered_photos_are_matched_with_those_that_follow_and_the_similar_ones():
-    chosen = choose_matching(FILM, NOWHERE)
-    assert_proper(chosen.pairs, 500)
-    assert chosen.similar == matching.LOOPS and "order of their names" in chosen.reason
-    steps = np.unique(chosen.pairs[:, 1] - chosen.pairs[:, 0])
-    assert steps.tolist() == [*range(1, 11), 16, 32, 64, 128, 256]
+def test_ordered_photos_are_matched_with_those_that_follow_and_every_tenth_with_every_tenth():
+    pairs, reason = choose_pairs(FILM, NOWHERE)
+    assert_proper(pairs, 500)
+    assert reason == "in the order of their names"
+    steps, counts = np.unique(pairs[:, 1] - pairs[:, 0], return_counts=True)
+    assert steps[counts > 100].tolist() == [*range(1, 11), 16, 32, 64, 128, 256]
+    assert [0, 490] in pairs.tolist() and [1, 491] not in pairs.tolist(), "a walk that comes back is closed"
+    assert len(pairs) < 500 * 20
 
 
 def test_the_order_is_that_of_the_numbers_not_of_the_letters():
     names = sorted(f"IMG_{number}.jpg" for number in range(1, 301))
-    chosen = choose_matching(names, NOWHERE[:300])
+    pairs, _ = choose_pairs(names, NOWHERE[:300])
     first = names.index("IMG_9.jpg")
-    assert {names.index("IMG_10.jpg"), names.index("IMG_8.jpg")} <= set(
-        chosen.pairs[(chosen.pairs == first).any(1)].flat
-    )
+    assert {names.index("IMG_10.jpg"), names.index("IMG_8.jpg")} <= set(pairs[(pairs == first).any(1)].flat)
     assert [names[view] for view in natural_order(names)][8:11] == ["IMG_9.jpg", "IMG_10.jpg", "IMG_11.jpg"]
 
 
 def test_photos_with_gps_are_matched_with_the_nearest():
     positions = flight(500, 400.0)
-    chosen = choose_matching(HASHES, positions)
-    assert_proper(chosen.pairs, 500)
-    assert chosen.similar == matching.LOOPS and "GPS" in chosen.reason
+    pairs, reason = choose_pairs(HASHES, positions)
+    assert_proper(pairs, 500)
+    assert reason == "with the 40 nearest by GPS"
     metres = metres_of(positions)
-    apart = np.linalg.norm(metres[chosen.pairs[:, 0]] - metres[chosen.pairs[:, 1]], axis=1)
+    apart = np.linalg.norm(metres[pairs[:, 0]] - metres[pairs[:, 1]], axis=1)
     assert apart.max() < 200  # of up to 560
-    assert (np.bincount(chosen.pairs.ravel(), minlength=500) >= matching.NEIGHBORS).all()
+    assert (np.bincount(pairs.ravel(), minlength=500) >= matching.NEIGHBORS).all()
 
 
 def test_gps_of_a_room_or_of_a_few_photos_says_nothing():
-    assert "similar" in choose_matching(HASHES, flight(500, 10.0)).reason
     some = flight(500, 400.0)
     some[::5] = np.nan
-    assert choose_matching(HASHES, some).similar == matching.ALIKE
+    for positions in (flight(500, 10.0), some):
+        pairs, reason = choose_pairs(HASHES, positions)
+        assert len(pairs) == 500 * 499 // 2 and "neither names nor GPS" in reason
 
 
 def test_photos_without_gps_among_those_with_it_are_matched_by_order():
     some = flight(500, 400.0)
     some[7] = np.nan
-    chosen = choose_matching(FILM, some)
-    assert_proper(chosen.pairs, 500)
-    assert (chosen.pairs == 7).any(axis=1).sum() >= 10
-
-
-def test_photos_of_no_order_are_matched_with_the_similar_ones():
-    chosen = choose_matching(HASHES, NOWHERE)
-    assert (chosen.pairs.shape, chosen.similar) == ((0, 2), matching.ALIKE)
+    pairs, _ = choose_pairs(FILM, some)
+    assert_proper(pairs, 500)
+    assert (pairs == 7).any(axis=1).sum() >= 10
 
 
 @pytest.mark.parametrize(
@@ -94,10 +90,6 @@ def test_photos_of_no_order_are_matched_with_the_similar_ones():
 )
 def test_what_counts_as_ordered(names, ordered):
     assert are_ordered(names) is ordered
-
-
-def test_a_short_sequence_has_no_pair_beyond_its_end():
-    assert sequential_pairs(3).tolist() == [[0, 1], [1, 2], [0, 2]]
 
 
 def test_metres_of_degrees():

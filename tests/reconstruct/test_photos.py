@@ -1,6 +1,5 @@
 """What photos' files say, and upright copies."""
 
-import math
 import os
 
 import numpy as np
@@ -9,6 +8,7 @@ from helpers.refusals import assert_refused
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.reconstruct import solver
 from turbogs_plugin.reconstruct.photos import place_photos, read_photos
 from turbogs_plugin.scene.photos import load_photos, photo_array, photo_sizes
 
@@ -39,6 +39,7 @@ def write(path, orientation: int = 1, gps=None, model: str = "", focal: float = 
         for tag, value, letters in ((1, latitude, "NS"), (3, longitude, "EW")):
             entries[tag] = letters[value < 0]
             entries[tag + 1] = (float(int(abs(value))), (abs(value) % 1) * 60, 0.0)
+        entries[5], entries[6] = b"\0", 30.0  # altitude, without which COLMAP takes no position
     turn = TURNS[orientation]
     stored = upright if turn is None else upright.transpose(turn)
     stored.save(path, exif=exif, **({"quality": 95} if path.suffix == ".jpg" else {}))
@@ -73,7 +74,6 @@ def test_upright_copies_keep_focal_length_and_gps(suffix, tmp_path):
     for number, turn in enumerate((1, 6, 8)):
         write(tmp_path / "raw" / f"{number}{suffix}", turn, gps=(-33.5, 151.25), model="Phone", focal=28)
     photos = read_photos(tmp_path / "raw")
-    np.testing.assert_allclose([photo.position for photo in photos], [(-33.5, 151.25)] * 3)
     place_photos(photos, tmp_path / "images")
     upright, turned, _ = (pycolmap.Bitmap.read(tmp_path / "images" / photo.name, True) for photo in photos)
     assert turned.exif_focal_length() == pytest.approx(upright.exif_focal_length()) and upright.exif_focal_length() > 30
@@ -116,15 +116,14 @@ def test_lenses_are_told_apart_by_exif_and_size(tmp_path):
     assert lenses[0] == lenses[1] and len(set(lenses)) == 3
 
 
-def test_damaged_gps_is_no_position(tmp_path):
-    for number in range(3):
-        exif = Image.Exif()
-        entries = exif.get_ifd(0x8825)
-        entries[1], entries[3] = "N", "E"
-        if number:
-            entries[2] = entries[4] = (0.0, 0.0, 0.0)
-        picture().save(tmp_path / f"{number}.jpg", exif=exif)
-    assert all(math.isnan(photo.position[0]) for photo in read_photos(tmp_path))
+def test_gps_is_read_from_upright_copies_and_photos_without_a_fix_have_none(tmp_path):
+    for number, gps in enumerate([(-33.5, 151.25), None, (0.0, 0.0), (-33.5, 151.25)]):
+        write(tmp_path / f"raw/{number}.jpg", 6 if number == 3 else 1, gps=gps)
+    photos, database = read_photos(tmp_path / "raw"), tmp_path / "features.db"
+    place_photos(photos, tmp_path / "images")
+    solver.extract_features(database, tmp_path / "images", photos, doubled=True)
+    found = solver.read_positions(database, [photo.name for photo in photos])
+    np.testing.assert_allclose(found, [(-33.5, 151.25), (np.nan,) * 2, (np.nan,) * 2, (-33.5, 151.25)])
 
 
 def test_names_have_no_spaces_and_folders_are_kept(tmp_path):

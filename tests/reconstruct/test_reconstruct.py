@@ -2,7 +2,6 @@
 
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -14,9 +13,7 @@ from PIL import Image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct import Solution, reconstruct, run, scene_beside, solver
 from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups
-from turbogs_plugin.reconstruct.effort import DEFAULTS, DOUBLED, QUICK, efforts_for
 from turbogs_plugin.reconstruct.photos import read_photos
-from turbogs_plugin.reconstruct.workspace import Workspace
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.load import holds_photos_alone
 
@@ -66,12 +63,9 @@ def test_the_solution_says_what_was_done_and_names_what_did_not_register(solved)
     _, solution = solved
     assert (solution.photos, solution.registered, solution.left_out) == (COUNT + 1, COUNT, ["other.jpg"])
     text = solution.text()
-    assert f"{COUNT + 1} photos of 1 lens, 2 turned upright by EXIF; matched each with each" in text
-    assert (
-        f"{COUNT} of {COUNT + 1} photos registered" in text
-        and "1 photo did not register: other.jpg; add photos between it and" in text
-    )
-    assert "ghost" not in text and "wrong place" not in text
+    assert f"{COUNT + 1} photos matched each with each" in text and f"{COUNT} of {COUNT + 1} photos registered" in text
+    assert "1 photo did not register: add photos between them and the others: other.jpg" in text
+    assert "structure" not in text and "wrong place" not in text
 
 
 def test_the_scene_loads(solved):
@@ -102,7 +96,7 @@ def test_a_stopped_call_is_gone_on_with(solved, tmp_path, monkeypatch):
         patch.setattr(solver, "solve_cameras", stop)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(few, tmp_path / "scene")
-    database = Workspace(tmp_path / "scene").database(DOUBLED)
+    database = tmp_path / "scene/reconstruction/features-doubled.db"
     with pycolmap.Database.open(database) as opened:
         before = opened.num_keypoints(), opened.num_matches(), len(opened.read_all_cameras())
         opened.delete_matches(1, 2)
@@ -116,7 +110,7 @@ def test_features_that_a_stopped_call_left_out_are_of_the_same_camera(solved, tm
     photos, solution = solved
     few, database = read_photos(photos)[1:4], tmp_path / "features.db"  # upright ones, of one lens
     for known in (few[:1], few):
-        solver.extract_features(database, Workspace(solution.scene).images, known, DOUBLED)
+        solver.extract_features(database, solution.scene / "images", known, doubled=True)
     with pycolmap.Database.open(database) as opened:
         assert (len(opened.read_all_images()), len(opened.read_all_cameras())) == (3, 1)
 
@@ -125,18 +119,18 @@ def test_other_photos_are_not_mixed_in(solved, tmp_path):
     photos, solution = solved
     fewer = shutil.copytree(photos, tmp_path / "fewer")
     (fewer / "other.jpg").unlink()
-    with pytest.raises(InputError, match=r"begun with other photos \(0 new, 1 gone, 0 changed since\)"):
+    with pytest.raises(InputError, match=r"begun with other photos.*choose a new --out, or delete it"):
         reconstruct(fewer, solution.scene)
-    (fewer / "new.jpg").write_bytes((fewer / "view_00.jpg").read_bytes())
-    (fewer / "view_00.jpg").touch()
-    with pytest.raises(InputError, match=r"\(1 new, 1 gone, 1 changed since\)"):
-        reconstruct(fewer, solution.scene)
+    changed = shutil.copytree(photos, tmp_path / "changed")
+    (changed / "view_00.jpg").touch()
+    with pytest.raises(InputError, match="begun with other photos, or they changed"):
+        reconstruct(changed, solution.scene)
 
 
 def blank(folder: Path, size: tuple[int, int] = (320, 240)) -> str:
     for number in range(3):
         Image.new("RGB", size, (90, 90, 90)).save(folder / f"{number}.jpg")
-    return "none of the 3 photos shows anything that could be found again"
+    return "no cameras were found for 3 photos: no photo shows anything that could be found again"
 
 
 def large_and_blank(folder: Path) -> str:
@@ -147,13 +141,13 @@ def large_and_blank(folder: Path) -> str:
 def of_different_things(folder: Path) -> str:
     for number in range(3):
         noise(number).save(folder / f"{number}.jpg")
-    return "no cameras were found for 3 photos: of 3 pairs of photos 0 match; take photos that overlap"
+    return "no cameras were found for 3 photos: 0 of 3 pairs of photos match; take sharp photos that overlap"
 
 
 def copies_of_one(folder: Path) -> str:
     for number in range(3):
         render_corner(camera_centers(COUNT)[3]).save(folder / f"{number}.jpg", quality=95)
-    return "no cameras were found for 3 photos: 3 of 3 pairs match, but they show no depth, .*move between the photos"
+    return "no cameras were found for 3 photos: 3 of 3 pairs of photos match; .*not by turning in one place"
 
 
 @pytest.mark.parametrize("case", [blank, large_and_blank, of_different_things, copies_of_one])
@@ -201,14 +195,12 @@ def agreement_of(places: str) -> Agreement:
 
 @pytest.fixture
 def attempts(monkeypatch, tmp_path):
-    """Solves that are made up: each takes the next of the given models; the pairs taken out are noted, and what is said
-    of each solve."""
+    """Solves that are made up: each takes the next of the given models; the pairs that are taken out are noted."""
 
-    def prepare(*models: str | None) -> tuple[list, list, Path, Workspace]:
-        waiting, removed, said = list(models), [], []
+    def prepare(*models: str | None) -> tuple[list, list]:
+        waiting, removed = list(models), []
 
-        def attempt(database, evidence, workspace, again):
-            said.append(again)
+        def attempt(*arguments):
             places = waiting.pop(0)
             if places is None:
                 return None
@@ -217,7 +209,7 @@ def attempts(monkeypatch, tmp_path):
 
         monkeypatch.setattr(run, "_attempt", attempt)
         monkeypatch.setattr(solver, "without_pairs", lambda database, copy, pairs: removed.append(pairs))
-        return removed, said, tmp_path / "some.db", Workspace(tmp_path / "scene")
+        return removed, [tmp_path / "some.db", tmp_path, tmp_path]
 
     return prepare
 
@@ -226,112 +218,85 @@ GOOD, GHOST = "oooooooooo", "gggooooooo"
 
 
 def test_a_ghost_is_solved_again_without_the_pairs_that_made_it(attempts):
-    removed, said, *places = attempts(GHOST, GOOD)
-    best, moved = run._solve(*places, " again, with more features")
-    assert said == [" again, with more features", " again, without the pairs that led to a ghost"]
+    removed, places = attempts(GHOST, GOOD)
+    best, moved = run._solve(*places)
     assert best.model.places == GOOD and best.ghosts == [] and moved == ["0.jpg", "1.jpg", "2.jpg"]
     (pairs,) = removed
     assert pairs and all((first < "3") != (second < "3") for first, second in pairs)
 
 
-def test_a_repair_that_fails_leaves_the_first_solve_with_its_ghosts_named(attempts):
-    for outcome in (None, GHOST):
-        removed, _, *places = attempts(GHOST, outcome)
-        best, moved = run._solve(*places)
-        assert best.model.places == GHOST and moved == [] and len(removed) == 1
-        assert best.ghosts == ["0.jpg", "1.jpg", "2.jpg"]
+@pytest.mark.parametrize("outcome", [None, GHOST])
+def test_a_repair_that_fails_leaves_the_first_solve_with_its_ghosts_named(attempts, outcome):
+    removed, places = attempts(GHOST, outcome)
+    best, moved = run._solve(*places)
+    assert best.model.places == GHOST and moved == [] and len(removed) == 1
+    assert best.ghosts == ["0.jpg", "1.jpg", "2.jpg"]
 
 
 def test_a_solve_without_ghosts_is_taken_as_it_is(attempts):
-    removed, _, *places = attempts(GOOD)
+    removed, places = attempts(GOOD)
     best, moved = run._solve(*places)
     assert (best.model.places, moved, removed) == (GOOD, [], [])
 
 
-def test_cameras_that_are_told_as_solved_are_those_of_the_largest_model(monkeypatch, tmp_path, capsys):
-    """COLMAP begins many times where photos do not connect, and registers some each time."""
-
-    def map_in_vain(*_, initial_image_pair_callback, next_image_callback, cancellation_token):
-        for _ in range(40):
-            initial_image_pair_callback()
-            next_image_callback()
-        return {0: FakeModel("ooo"), 1: FakeModel("oooo")}
-
-    monkeypatch.setattr(pycolmap, "incremental_mapping", map_in_vain)
-    models = solver.solve_cameras(tmp_path / "none.db", tmp_path, tmp_path / "scratch")
-    assert [model.num_reg_images() for model in models] == [4, 3]
-    assert capsys.readouterr().err.startswith("cameras solved: 4 in ")
-
-
-def fake_steps(monkeypatch) -> tuple[list, list]:
-    """Steps that do nothing: the efforts that features were looked for with, and what is said of each solve."""
-    efforts, said = [], []
-    monkeypatch.setattr(solver, "extract_features", lambda *arguments: efforts.append(arguments[3]))
-    monkeypatch.setattr(solver, "match_features", lambda *arguments: None)
-    monkeypatch.setattr(solver, "with_default_cameras", lambda *arguments: efforts.append(DEFAULTS))
-    monkeypatch.setattr(solver, "read_names", lambda database: {"a"})
-    monkeypatch.setattr(solver, "count_verified_pairs", lambda database: 3)
-
-    def solve(database: Path, images: Path, scratch: Path, again: str) -> list:
-        said.append(again)
-        return []
-
-    monkeypatch.setattr(solver, "solve_cameras", solve)
-    return efforts, said
-
-
-@pytest.mark.parametrize(
-    ("side", "efforts", "said"),
-    [
-        (800, [DOUBLED, DEFAULTS], ["", DEFAULTS.again]),
-        (1200, [QUICK, DOUBLED, DEFAULTS], ["", DOUBLED.again, DEFAULTS.again]),
-    ],
-)
-def test_where_too_few_photos_register_more_is_done(monkeypatch, tmp_path, side, efforts, said):
-    """Small photos begin with the second effort, as there is little to find in them."""
+@pytest.mark.parametrize(("side", "efforts"), [(800, [True]), (1200, [False, True])])
+def test_where_too_few_photos_register_more_features_are_looked_for(monkeypatch, tmp_path, side, efforts):
+    """Small photos, in which there is little to find, begin with more."""
     for number in range(3):
         Image.new("RGB", (side, side // 2)).save(tmp_path / f"{number}.jpg")
-    done, told = fake_steps(monkeypatch)
-    with pytest.raises(InputError, match="no cameras were found for 3 photos"):
+    done = []
+    monkeypatch.setattr(solver, "extract_features", lambda *arguments: done.append(arguments[3]))
+    monkeypatch.setattr(solver, "read_positions", lambda database, names: np.full((3, 2), np.nan))
+    for name, given in {
+        "match_features": None,
+        "count_features": 9,
+        "count_verified_pairs": 3,
+        "solve_cameras": [],
+    }.items():
+        monkeypatch.setattr(solver, name, lambda *arguments, given=given: given)
+    with pytest.raises(InputError, match="no cameras were found for 3 photos: 3 of 3 pairs of photos match"):
         reconstruct(tmp_path, tmp_path / "../scene")
-    assert done == efforts and told == said and efforts_for(side) == tuple(efforts)
+    assert done == efforts
 
 
-@pytest.mark.parametrize(("out", "word"), [(["a.jpg"], "it"), (["a.jpg", "b.jpg"], "them")])
-def test_lines_about_one_photo_and_about_several(out, word):
-    model = SimpleNamespace(num_points3D=lambda: 1, compute_mean_reprojection_error=lambda: 1.0)
-    solve = run.Solve(model, (3, 3), agreement_of("ooo"), [[0, 1, 2]])
-    matching = run.choose_matching(["0.jpg", "1.jpg", "2.jpg", *out], np.full((3 + len(out), 2), np.nan))
-    (line,) = (note for note in run._notes([], matching, 3, solve, [], out) if "did not register" in note)
-    assert ", 1 smaller model besides: " in line and line.endswith(f"; add photos between {word} and the others")
+def test_a_small_part_of_the_photos_is_not_taken_for_the_scene(monkeypatch, solved, tmp_path):
+    part = run.Solve(FakeModel("ooo"), (3, 2), agreement_of("ooo"), [[0, 1, 2]])
+    monkeypatch.setattr(run, "_solve", lambda *arguments: (part, []))
+    monkeypatch.setattr(solver, "match_features", lambda *arguments: None)
+    with pytest.raises(InputError, match=r"only 3 of 8 photos connect \(models of 3, 2 photos\): take sharp photos"):
+        reconstruct(solved[0], tmp_path / "scene")
 
 
-def test_photos_at_a_ghost_are_taken_out_of_the_model(solved, tmp_path):
+def test_a_ghost_that_stays_is_left_out_and_doubtful_photos_are_named(solved):
     model = pycolmap.Reconstruction(solved[1].scene / "sparse/0")
-    run._leave_out(model, ["view_00.jpg", "view_05.jpg"])
-    model.write_binary(tmp_path)
-    written = pycolmap.Reconstruction(tmp_path)
-    names = {image.name for image in written.images.values() if image.has_pose}
-    assert len(names) == COUNT - 2 and not names & {"view_00.jpg", "view_05.jpg"}
+    ghost = run.Solve(model, (10,), agreement_of(GHOST), consistent_groups(agreement_of(GHOST)))
+    notes = "\n".join(run._notes(ghost, 10, ["9.jpg"], ["0.jpg", "1.jpg", "2.jpg", "x.jpg"]))
+    assert "1 photo moved, as repeated structure misled the first solve" in notes and ": 9.jpg" in notes
+    assert "3 photos left out, as more matches contradict their place" in notes and ": 0.jpg, 1.jpg, 2.jpg" in notes
+    assert "1 photo did not register: add photos between them and the others: x.jpg" in notes
 
 
-def test_scenes_that_do_not_connect_are_told_by_their_numbers():
-    agreement = agreement_of("ooo")
-    solve = run.Solve(FakeModel("ooo"), (3, 3, 3), agreement, [[0, 1, 2]])
-    matching = run.choose_matching([f"{view}.jpg" for view in range(9)], np.full((9, 2), np.nan))
-    with pytest.raises(InputError, match="9 photos fall into 3 scenes that do not connect, of 3, 3, 3 photos: add"):
-        run._require_solved(solve, 9, 12, matching)
-    alone = run.Solve(FakeModel("ooo"), (3,), agreement, [[0, 1, 2]])
-    with pytest.raises(InputError, match=r"only 3 of 9 photos connect \(12 pairs match\)"):
-        run._require_solved(alone, 9, 12, matching)
-    run._require_solved(alone, 6, 12, matching)
+def test_photos_at_a_ghost_are_taken_out_of_the_model(solved, tmp_path, monkeypatch):
+    """Here the matches are made to say so of two photos."""
+
+    def groups(agreement: Agreement, doubt: float = 1.0) -> list[list[int]]:
+        return [[1, 2, 3, 4, 6], [0, 5]]
+
+    monkeypatch.setattr(run, "consistent_groups", groups)
+    monkeypatch.setattr(solver, "without_pairs", lambda database, copy, pairs: shutil.copy(database, copy))
+    scene = shutil.copytree(solved[1].scene, tmp_path / "scene")
+    (scene / "reconstruction/solution.json").unlink()
+    solution = reconstruct(solved[0], scene)
+    model = pycolmap.Reconstruction(scene / "sparse/0")
+    names = {image.name for image in model.images.values() if image.has_pose}
+    assert solution.registered == len(names) == COUNT - 2 and not names & {"view_00.jpg", "view_05.jpg"}
+    assert solution.left_out == ["other.jpg", "view_00.jpg", "view_05.jpg"]
 
 
 def test_matches_agree_with_the_cameras_that_were_solved_and_not_with_moved_ones(solved):
     _, solution = solved
-    workspace = Workspace(solution.scene)
-    database = workspace.database(DOUBLED)
-    model = pycolmap.Reconstruction(workspace.model)
+    database = solution.scene / "reconstruction/features-doubled.db"
+    model = pycolmap.Reconstruction(solution.scene / "sparse/0")
     agreement = solver.measure_agreement(model, database)
     assert agreement.names == tuple(f"view_{view:02d}.jpg" for view in range(COUNT))
     assert agreement.agreeing.sum() > 50 * agreement.contradicting.sum()
@@ -341,34 +306,6 @@ def test_matches_agree_with_the_cameras_that_were_solved_and_not_with_moved_ones
     pose.translation += np.array([1.5, 0.5, 0.0])
     moved.frame.rig_from_world = pose
     assert consistent_groups(solver.measure_agreement(model, database)) == [list(range(1, COUNT)), [0]]
-
-
-def test_the_similar_photos_of_many_are_found_without_a_download(solved, tmp_path):
-    """Each photo matched with the 3 most similar alone, as captures of many photos without an order are."""
-    _, solution = solved
-    workspace = Workspace(solution.scene)
-    database = tmp_path / "features.db"
-    shutil.copy(workspace.database(DOUBLED), database)
-    with pycolmap.Database.open(database) as opened:
-        opened.clear_matches()
-        opened.clear_two_view_geometries()
-    names = sorted(solver.read_names(database))
-    solver.match_features(database, tmp_path, names, run.Matching(np.zeros((0, 2), dtype=np.int64), 3, "alike"))
-    with pycolmap.Database.open(database) as opened:
-        matched = len(opened.read_all_matches()[0])
-    assert COUNT <= matched <= 3 * (COUNT + 1)
-    assert solver.count_verified_pairs(database) >= COUNT - 1
-
-
-def test_where_photos_are_left_colmaps_own_defaults_are_tried(solved):
-    """They do not register the other photo either, so that the first solve stays."""
-    workspace = Workspace(solved[1].scene)
-    models = []
-    for effort in (DOUBLED, DEFAULTS):  # the photos are small
-        with pycolmap.Database.open(workspace.database(effort)) as opened:
-            (camera,) = opened.read_all_cameras()
-            models.append((camera.model.name, camera.width, camera.focal_length_x, opened.num_keypoints()))
-    assert [model[0] for model in models] == ["OPENCV", "SIMPLE_RADIAL"] and models[0][1:] == models[1][1:]
 
 
 def test_where_the_capture_of_a_run_lies(tmp_path):
@@ -405,15 +342,6 @@ def test_commands_that_cannot_look_for_cameras_say_what_does(solved, tmp_path, t
     code, out, err = turbogs("plan", photos, "--device", "cpu")
     assert (code, out) == (2, "") and err.count("\n") == 1
     assert f"{photos} has {COUNT + 1} photos and nothing" in err and "turbogs reconstruct" in err
-
-
-def test_a_command_to_copy_is_right_for_folders_with_spaces(tmp_path, turbogs):
-    photos = tmp_path / "my photos"
-    photos.mkdir()
-    for name in "abc":
-        Image.new("RGB", (64, 48)).save(photos / f"{name}.jpg")
-    code, _, err = turbogs("plan", photos, "--device", "cpu")
-    assert code == 2 and f"turbogs reconstruct '{photos}' --out SCENE" in err
 
 
 def test_the_command_refuses_in_one_line(tmp_path, turbogs):
@@ -506,3 +434,38 @@ def test_a_reconstruction_in_parts_is_not_taken_for_photos_alone(solved, tmp_pat
     (scene / "sparse/0/points3D.bin").unlink()
     assert not holds_photos_alone(scene) and holds_photos_alone(scene / "images")
     assert holds_photos_alone(solved[0].parent) and not holds_photos_alone(tmp_path)
+
+
+def test_a_model_that_a_full_disk_cut_is_no_solution(solved, tmp_path):
+    model = pycolmap.Reconstruction(solved[1].scene / "sparse/0")
+
+    class Cut:
+        def num_points3D(self) -> int:
+            return model.num_points3D()
+
+        def write_binary(self, folder: Path) -> None:
+            model.write_binary(folder)
+            with open(folder / "images.bin", "r+b") as file:
+                file.truncate(100)
+
+    with pytest.raises(OSError, match="cannot be written whole"):
+        run._write_model(Cut(), tmp_path / "sparse", tmp_path / "scratch")
+    assert not (tmp_path / "sparse").exists()
+
+
+def test_a_scene_is_made_by_one_process(solved, tmp_path, monkeypatch):
+    photos, scene = solved[0], tmp_path / "scene"
+
+    def meanwhile(*arguments) -> str:
+        with pytest.raises(InputError, match="scene' is being made by another process: wait for it"):
+            reconstruct(photos, scene)
+        return "made"
+
+    monkeypatch.setattr(run, "_reconstruct", meanwhile)
+    assert reconstruct(photos, scene) == "made"
+
+
+@pytest.mark.parametrize(("out", "words"), [("a file", "holds something else"), ("a file/scene", "not a folder")])
+def test_a_file_is_no_place_for_a_scene(solved, tmp_path, out, words):
+    (tmp_path / "a file").write_text("x")
+    assert_refused(words, reconstruct, solved[0], tmp_path / out)

@@ -1,9 +1,8 @@
-"""Ablations: the grid, statistics over seeds, and the summary."""
+"""Studies: the cells of an ablation, statistics over seeds, and plots."""
 
 import functools
 import math
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,11 +13,11 @@ from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.config.yaml_text import packaged_names
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.study.grid import PACKAGE, Ablation, alike_at, load_ablation, variant_config
-from turbogs_plugin.study.plots import OTHER_COLOR, draw_curves, draw_front, told_apart
-from turbogs_plugin.study.results import CellResult, Study
-from turbogs_plugin.study.statistics import Curve, Difference, Spread, pareto_front, seconds_to_reach
-from turbogs_plugin.study.summary import VariantRow, summarise
+from turbogs_plugin.study.grid import PACKAGE, Ablation, load_ablation, variant_config
+from turbogs_plugin.study.results import CellResult, Study, curve_and_final
+from turbogs_plugin.study.statistics import Difference, Spread, mean_curve, pareto_front, seconds_to_reach, summarise
+from turbogs_plugin.study.study_plots import draw_over_size, draw_over_time, shown_rows
+from turbogs_plugin.study.study_report import report_text
 from turbogs_plugin.train.history import Evaluation
 
 
@@ -27,11 +26,8 @@ def entry(iteration: int, seconds: float, psnr: float, count: int = 100) -> Eval
 
 
 def cell(variant: str, seed: int, *entries: Evaluation, scene: str = "fox") -> CellResult:
-    config = load_config("turbogs", [f"train.seed={seed}", f"train.iterations={entries[-1].iteration}"])
-    mapping = config.to_mapping()
-    return CellResult(
-        scene=scene, variant=variant, seed=seed, config=mapping, asked=mapping, history=list(entries), fps=100.0
-    )
+    curve, final = curve_and_final(entries)
+    return CellResult(scene=scene, variant=variant, seed=seed, settings={}, curve=curve, final=final)
 
 
 # The grid
@@ -172,66 +168,67 @@ def test_a_number_of_steps_and_a_time_budget_exclude_each_other(own, of_all):
         variant_config(ablation, "timed", 0, of_all, 4)
 
 
-def test_a_common_length_leaves_out_what_it_makes_a_copy():
-    ablation = load_ablation("leave_out")
-    alike = {"epochs-50": "nothing", "epochs-75": "nothing"}
-    assert alike_at(ablation, list(ablation.variants), (), 1000) == alike
-    assert alike_at(ablation, ["nothing", "sh-2", "epochs-75"], (), 1000) == {"epochs-75": "nothing"}
-    assert alike_at(load_ablation("batch"), ["x2-same-rates", "x2-longer"], (), 1000) == {"x2-longer": "x2-same-rates"}
-    departures = load_ablation("departures")
-    assert alike_at(departures, list(departures.variants), (), 1000) == {"iterations-5000": "turbogs"}
-    for name in set(packaged_names(PACKAGE)) - {"leave_out", "batch", "departures"}:
-        assert alike_at(load_ablation(name), list(load_ablation(name).variants), (), 1000) == {}
-    same = Ablation(
-        "x", {"long": ["train.iterations=5000"], "a": [], "b": [], "last": ["train.epochs=5"]}, baseline="a"
-    )
-    assert alike_at(same, list(same.variants), (), 1000) == {"long": "a", "last": "a"}
-
-
 # Statistics
 
 
-def test_spreads_and_differences():
+def test_spreads_and_unpaired_differences():
     first = Spread.of([30.0, 30.2])
-    assert (first.mean, first.low, first.high, first.count) == (pytest.approx(30.1), 30.0, 30.2, 2)
-    assert math.isnan(Spread.of([1.0, math.nan]).mean)
-    five = Difference.of([0.1, 0.2, 0.3, 0.2, 0.2])
-    assert (five.mean, five.standard_error) == (pytest.approx(0.2), pytest.approx(0.1 / math.sqrt(10)))
-    assert five.clear is True and Difference.of([-0.1, 0.2, 0.3, 0.2, -0.2]).clear is False
-    assert Difference.of([0.3]).clear is None and math.isnan(Difference.of([]).mean)
+    assert (first.mean, first.standard_error, first.count) == (pytest.approx(30.1), pytest.approx(0.1), 2)
+    assert math.isnan(Spread.of([1.0, math.nan]).mean) and math.isnan(Spread.of([1.0]).standard_error)
+    assert math.isnan(Spread.of([]).mean)
+    apart = Difference.of([30.5, 30.7, 30.6], [30.0, 30.2, 30.1])
+    assert (apart.mean, apart.standard_error) == (pytest.approx(0.5), pytest.approx(math.sqrt(2 * 0.01 / 3)))
+    assert apart.clear is True
+    assert Difference.of([30.2, 30.7, 29.9], [30.0, 30.2, 30.1]).clear is False
+    assert Difference.of([31.0, 31.0, 31.0], [30.0, 30.0, 30.0]).clear is True
+    assert Difference.of([31.0], [30.0]).clear is None and Difference.of([31.0], [30.0]).mean == 1.0
+    assert math.isnan(Difference.of([31.0], []).mean)
 
 
-def test_a_difference_is_taken_seed_by_seed_of_the_seeds_that_both_have():
-    """The baseline's third seed is an accident that the variant never had: it counts for neither."""
-    values = {"base": {0: 30.0, 1: 34.0, 2: 10.0}, "other": {1: 34.5, 0: 30.5, 7: 99.0}}
-    cells = [cell(name, seed, entry(1, 1.0, psnr)) for name, of in values.items() for seed, psnr in of.items()]
-    (summary,) = summarise(Study(Ablation("x", {"base": [], "other": []}), cells))
-    assert summary.rows[1].difference("psnr") == Difference(0.5, 0.0, 2)
+@pytest.mark.parametrize("seeds", [2, 3])
+def test_a_difference_is_clear_from_three_seeds_on(seeds):
+    own, base = [31.0, 31.01, 31.02][:seeds], [30.0, 30.01, 30.02]
+    assert Difference.of(own, base).clear is (True if seeds == 3 else None)
+    assert Difference.of(base, own).clear is (True if seeds == 3 else None)
+
+
+def test_the_order_of_seeds_decides_nothing():
+    """Paired by seed, these would differ by exactly .1; as two groups they do not."""
+    base = [30.0, 31.0, 32.0]
+    assert Difference.of([value + 0.1 for value in base], base).clear is False
+
+
+def test_welch_s_degrees_of_freedom_follow_the_spreads():
+    """One noisy group of three beside a steady one has two degrees of freedom: 4.3 standard errors are needed."""
+    steady, noisy = [0.0, 1e-6, -1e-6], [-1.0, 0.0, 1.0]
+    error = 1.0 / math.sqrt(3)
+    for errors, clear in ((4.2, False), (4.4, True)):
+        assert Difference.of([value + errors * error for value in noisy], steady).clear is clear
+
+
+def columns(*rows: tuple[int, float, float]) -> dict[str, list[float]]:
+    """A curve of (iteration, seconds, PSNR)."""
+    return curve_and_final([entry(*row) for row in rows])[0]
 
 
 def test_time_to_a_psnr_is_linear_between_evaluations():
-    history = [entry(0, 0.5, 10.0), entry(10, 2.5, 20.0), entry(20, 4.5, 18.0), entry(30, 6.5, 24.0)]
-    assert seconds_to_reach(history, 9.0) == 0.5
-    assert seconds_to_reach(history, 15.0) == pytest.approx(1.5)
-    assert seconds_to_reach(history, 19.0) == pytest.approx(2.3)
-    assert seconds_to_reach(history, 21.0) == pytest.approx(5.5)
-    assert seconds_to_reach(history, 24.1) == math.inf
+    curve = columns((0, 0.5, 10.0), (10, 2.5, 20.0), (20, 4.5, 18.0), (30, 6.5, 24.0))
+    assert seconds_to_reach(curve, 9.0) == 0.5
+    assert seconds_to_reach(curve, 15.0) == pytest.approx(1.5)
+    assert seconds_to_reach(curve, 19.0) == pytest.approx(2.3)
+    assert seconds_to_reach(curve, 21.0) == pytest.approx(5.5)
+    assert seconds_to_reach(curve, 24.1) == math.inf
+    assert seconds_to_reach({**curve, "ssim": [0.1, 0.5, 0.5, 0.9]}, 0.3, "ssim") == pytest.approx(1.5)
 
 
-def test_a_curve_pairs_common_iterations_and_the_ends():
-    early = [entry(0, 0.0, 10.0), entry(10, 2.0, 20.0), entry(17, 3.0, 21.0)]
-    late = [entry(0, 1.0, 12.0), entry(8, 3.0, 16.0), entry(10, 4.0, 22.0), entry(19, 5.0, 25.0)]
-    curve = Curve.of([early, late], "psnr")
-    np.testing.assert_allclose(curve.seconds, [0.5, 3.0, 4.0])
-    np.testing.assert_allclose([curve.mean, curve.low, curve.high], [[11, 21, 23], [10, 20, 21], [12, 22, 25]])
-
-
-def test_a_curve_of_runs_by_time_pairs_evaluations_in_their_order():
-    first = [entry(0, 0.0, 10.0), entry(9, 2.0, 20.0), entry(17, 4.0, 21.0)]
-    second = [entry(0, 0.0, 12.0), entry(10, 2.0, 22.0), entry(19, 4.0, 25.0)]
-    curve = Curve.of([first, second], "psnr")
-    np.testing.assert_allclose(curve.seconds, [0.0, 2.0, 4.0])
-    np.testing.assert_allclose([curve.mean, curve.low, curve.high], [[11, 21, 23], [10, 20, 21], [12, 22, 25]])
+def test_a_mean_curve_pairs_evaluations_in_their_order_and_the_ends():
+    first = columns((0, 0.0, 10.0), (9, 2.0, 20.0), (17, 4.0, 21.0))
+    second = columns((0, 0.0, 12.0), (10, 2.0, 22.0), (19, 4.0, 25.0))
+    (seconds, values), (_, errors) = mean_curve([first, second], "psnr")
+    np.testing.assert_allclose([seconds, values, errors], [[0, 2, 4], [11, 21, 23], [1, 1, 2]])
+    longer = columns((0, 0.0, 12.0), (10, 2.0, 22.0), (15, 3.0, 22.5), (19, 4.0, 25.0))
+    np.testing.assert_allclose(mean_curve([first, longer], "psnr")[0], [[0, 2, 4], [11, 21, 23]])
+    np.testing.assert_array_equal(mean_curve([first], "psnr")[1], np.zeros((2, 3)))
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=1, max_size=12))
@@ -252,75 +249,61 @@ def test_a_summary_of_known_numbers():
         [
             cell("base", 0, entry(0, 0.0, 10.0), entry(100, 10.0, 30.0, 1000)),
             cell("base", 1, entry(0, 0.0, 10.0), entry(100, 12.0, 30.2, 1200)),
-            cell("fast", 0, entry(0, 0.0, 10.0), entry(100, 5.0, 31.0)),
-            cell("fast", 1, entry(0, 0.0, 10.0), entry(100, 5.0, 31.0)),
+            cell("fast", 2, entry(0, 0.0, 10.0), entry(100, 5.0, 31.0)),
+            cell("fast", 3, entry(0, 0.0, 10.0), entry(100, 5.0, 31.0)),
+            cell("fast", 4, entry(0, 0.0, 10.0), entry(100, 5.0, 31.0)),
             cell("slow", 0, entry(0, 0.0, 10.0), entry(100, 20.0, 30.1)),
             cell("slow", 1, entry(0, 0.0, 10.0), entry(100, 20.0, 20.0)),
         ],
     )
-    (summary,) = summarise(replace(study, targets=[20.0, 30.5]))
+    (summary,) = summarise(study, [20.0, 30.5])
     base, fast, slow = summary.rows
-    assert (base.seconds.mean, base.spread("gaussians").mean) == (11.0, 1100.0)
+    assert (base.spread("seconds").mean, base.spread("gaussians").mean) == (11.0, 1100.0)
     assert fast.difference("psnr").mean == pytest.approx(0.9) and fast.ratio("seconds") == pytest.approx(5.0 / 11.0)
-    assert fast.difference("psnr").standard_error == pytest.approx(0.1)  # 1.0 and 0.8
-    assert fast.difference("psnr").clear is False  # two seeds say little: 12.7 standard errors are needed
-    assert slow.difference("seconds") == Difference(9.0, 1.0, 2)
+    assert fast.difference("psnr").standard_error == pytest.approx(0.1)
     assert [row.on_front for row in summary.rows] == [False, True, False]
     of_base = (10.0 * 10 / 20.0 + 12.0 * 10 / 20.2) / 2
     assert np.mean(base.seconds_to(20.0)) == pytest.approx(of_base) and base.ratio_to(20.0) == pytest.approx(1.0)
     assert fast.ratio_to(20.0) == pytest.approx(5.0 * 10 / 21.0 / of_base)
     assert [np.isfinite(slow.seconds_to(target)).sum() for target in (20.0, 30.5)] == [2, 0]
-    assert math.isnan(fast.ratio_to(30.5))  # the baseline never got there
-    (begun,) = summarise(replace(study, targets=[9.0]))
-    assert [(np.isfinite(row.seconds_to(9.0)).sum(), math.isnan(row.ratio_to(9.0))) for row in begun.rows] == [
-        (2, True)
-    ] * 3
+    assert math.isnan(fast.ratio_to(30.5)), "the baseline never got there"
+    (begun,) = summarise(study, [9.0])
+    assert all(math.isnan(row.ratio_to(9.0)) for row in begun.rows)
     (default,) = summarise(study)
     assert default.targets == [29.0, 29.5, 30.0]
 
 
-def test_ratios_are_over_the_seeds_that_both_have():
-    """A baseline of more seeds than the variant, one of which is slow and large, changes nothing."""
-    cells = [
-        cell("base", 0, entry(0, 0.0, 10.0), entry(100, 10.0, 30.0, 1000)),
-        cell("base", 1, entry(0, 0.0, 10.0), entry(100, 70.0, 30.0, 7000)),
-        cell("other", 2, entry(0, 0.0, 10.0), entry(100, 99.0, 30.0, 9000)),
-        cell("other", 0, entry(0, 0.0, 10.0), entry(100, 5.0, 30.0, 2000)),
-    ]
-    (summary,) = summarise(Study(Ablation("x", {"base": [], "other": []}), cells, targets=[20.0]))
-    other = summary.rows[1]
-    assert (other.ratio("seconds"), other.ratio("gaussians")) == (0.5, 2.0)
-    assert other.ratio_to(20.0) == 0.5 and other.difference("seconds").count == 1
-    assert math.isnan(VariantRow("lone", cells[:1], []).ratio("seconds"))
+def test_a_capture_without_the_baseline_is_compared_with_nothing():
+    cells = [cell("base", 0, entry(1, 1.0, 30.0)), cell("other", 0, entry(1, 1.0, 31.0), scene="h")]
+    study = Study(Ablation("x", {"base": [], "other": []}), cells)
+    fox, h = summarise(study)
+    assert (fox.baseline, h.baseline) == ("base", "")
+    assert "nan" not in report_text(study, [fox, h])
+
+
+# Plots
 
 
 def test_a_variant_that_failed_does_not_set_the_scale_of_the_plots():
     results = {"good": 31.0, "fair": 24.0, "lost": 9.5, "unknown": math.nan}
     cells = [cell(name, 0, entry(0, 0.0, 5.0), entry(100, 10.0, psnr)) for name, psnr in results.items()]
-    (summary,) = summarise(Study(Ablation("x", {name: [] for name in results}), cells, targets=[20.0]))
-    shown, words = told_apart(summary)
-    assert [row.name for row in shown] == ["good", "fair", "unknown"]
-    assert words == "Not in the plot: lost (9.5 dB in 10.0 s)"
+    (summary,) = summarise(Study(Ablation("x", {name: [] for name in results}), cells), [20.0])
+    assert [row.name for row in shown_rows(summary)] == ["good", "fair", "unknown"]
 
 
-@pytest.mark.parametrize(("count", "grey"), [(10, 0), (11, 9)])
-def test_of_many_variants_the_baseline_and_the_front_stand_out(count, grey):
-    names = [f"v{number}" for number in range(count)]
-    cells = [cell(name, 0, entry(0, 0.0, 20.0), entry(100, 10.0 + n, 30.0 - n / 10)) for n, name in enumerate(names)]
-    study = Study(Ablation("x", {name: [] for name in names}, baseline="v5"), cells, targets=[20.0])
-    (summary,) = summarise(study)
-    figure = draw_curves(summary)
-    for axes in figure.axes:
-        lines = axes.get_lines()
-        assert [line.get_color() for line in lines[:grey]] == [OTHER_COLOR] * grey
-        named = [line.get_label() for line in lines[grey:]]
-        assert named == (["v0", "v5"] if grey else names)
-    legend = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert legend == ([f"{grey} others", "v0", "v5"] if grey else names)
-
-
-def test_names_of_points_are_kept_clear_of_what_is_behind():
-    cells = [cell(name, 0, entry(0, 0.0, 20.0), entry(100, 10.0, 30.0)) for name in ("a", "b")]
-    (summary,) = summarise(Study(Ablation("x", {"a": [], "b": []}), cells, targets=[20.0]))
-    texts = draw_front(summary).axes[0].texts
-    assert [text.get_text() for text in texts] == ["a", "b"] and all(text.get_path_effects() for text in texts)
+def test_a_study_has_two_plots_of_all_its_captures():
+    cells = [
+        cell(name, seed, entry(0, 0.0, 20.0), entry(100, 10.0 + seed, 30.0), scene=scene)
+        for name in ("a", "b")
+        for seed in (0, 1)
+        for scene in ("fox", "h")
+    ]
+    summaries = summarise(Study(Ablation("x", {"a": [], "b": []}), cells))
+    over_time, over_size = draw_over_time(summaries), draw_over_size(summaries)
+    assert [axes.get_title() for axes in over_time.axes] == ["fox", "fox", "h", "h"]
+    assert [axes.get_ylabel() for axes in over_time.axes[:2]] == ["test PSNR in dB", "test SSIM"]
+    assert [axes.get_title() for axes in over_size.axes] == ["fox", "h"]
+    np.testing.assert_allclose(over_time.axes[2].get_lines()[1].get_xdata(), [0.0, 10.5])
+    for figure in (over_time, over_size):
+        (legend,) = figure.legends
+        assert [text.get_text() for text in legend.get_texts()] == ["a", "b"], "each variant once"

@@ -74,7 +74,7 @@ def test_a_plan_is_refused_as_the_run(capture):
 
 
 def test_a_factor_for_which_photos_are_too_small_is_refused_before_they_are_reconstructed(tmp_path, monkeypatch):
-    monkeypatch.setattr("turbogs_plugin.reconstruct.train_on_photos.reconstruct", None)
+    monkeypatch.setattr("turbogs_plugin.reconstruct.run.reconstruct", None)
     photos = tmp_path / "walk"
     photos.mkdir()
     for number in range(3):

@@ -1,4 +1,4 @@
-"""`turbogs ablate`, `compare` and `report`."""
+"""`turbogs ablate` and `turbogs report`."""
 
 from __future__ import annotations
 
@@ -7,114 +7,85 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from turbogs_plugin.commands.options import (
-    Count,
-    Decibels,
-    Device,
-    Studies,
-    Time,
-    budget_overrides,
-    read_amount,
-    require_positive,
-)
+from turbogs_plugin.commands.options import Count, Decibels, Device, require_positive
 from turbogs_plugin.errors import InputError
 
 
 def ablate(
-    names: Annotated[Positional[tuple[str, ...]], arg(metavar="NAME_OR_FILE ... [section.key=value ...]")] = (),
+    name: Annotated[Positional[str], arg(metavar="NAME_OR_FILE")],
+    overrides: Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")] = (),
     /,
     *,
     out: Path,
     scene: Annotated[UseAppendAction[tuple[Path, ...]], arg(metavar="SCENE")] = (),
     seeds: Annotated[tuple[int, ...], arg(metavar="N ...")] = (0,),
     steps: Count = None,
-    time_budget: Time = None,
     only: Annotated[tuple[str, ...], arg(metavar="VARIANT ...")] = (),
-    psnr: Decibels = (),
-    merge: Studies = (),
-    within: Time = None,
-    gpus: Annotated[str | None, arg(metavar="0,1,...")] = None,
+    gpus: Count = None,
     device: Device = "auto",
 ) -> int:
-    """Train named variants over scenes and seeds: error against run time. The same call goes on where it stopped, and
-    may be made on several machines that share the folder --out: no cell is trained twice.
+    """Train named variants over captures and seeds: error against run time. A call may be stopped at any moment; the
+    same call goes on, and several calls may share the folder --out: no cell is trained twice.
 
     Args:
-        names: packaged ablations (parts, components, views, ...) or .yaml files; then changes of every
-            variant's configuration.
-        out: folder of the study, or of one for each of several ablations; finished cells in it are kept.
+        name: packaged ablation (parts, components, views, ...) or .yaml file.
+        overrides: changes of every variant's configuration.
+        out: folder of the study; finished cells in it are kept.
         scene: folder of a capture; may be given several times.
-        seeds: of each variant; two at least, or nothing can be called different.
+        seeds: of each variant; three at least, or no difference can be called clear.
         steps: iterations of every cell; what counts iterations is scaled with them.
-        time_budget: of every cell, as in train.
         only: these variants and the baseline.
-        psnr: test PSNRs whose time is asked for; from the baseline's result where absent.
-        merge: put these studies together in --out and write the report, without training.
-        within: begin no further cell after so much time: 9m. The same call then goes on; the exit code is 3.
-        gpus: numbers of GPUs, a process each, which share the cells.
+        gpus: number of this machine's GPUs, each of which trains a cell at a time.
         device: where to train.
     """
     from turbogs_plugin.config.configuration import DEFAULT_CONFIG, require_one_length
-    from turbogs_plugin.config.units import parse_seconds
-    from turbogs_plugin.study import commands
-    from turbogs_plugin.study.sweep import SweepOptions
+    from turbogs_plugin.study.grid import load_ablation
+    from turbogs_plugin.study.run_cells import CellChoice, run_study
 
-    require_positive("--psnr", psnr)
-    ablations = [text for text in names if "=" not in text]
-    budget = budget_overrides(None, time_budget)
-    overrides = (*(text for text in names if "=" in text), *budget)
-    if merge:
-        if names or scene or only or seeds != (0,) or device != "auto" or {steps, time_budget, within, gpus} != {None}:
-            raise InputError("--merge trains nothing: give it --out and --psnr alone")
-        return commands.merge(merge, out, psnr)
-    if not ablations or not scene:
-        raise InputError("ablate needs NAME_OR_FILE and --scene SCENE, or --merge STUDY ...")
-    if only and len(ablations) > 1:
-        raise InputError("--only names variants of one ablation: give it one NAME_OR_FILE")
-    if steps is not None:
-        require_positive("--steps", (steps,))
+    if not scene:
+        raise InputError("ablate needs --scene SCENE: the folder of a capture")
+    for option, count in (("--steps", steps), ("--gpus", gpus)):
+        require_positive(option, () if count is None else (count,))
     require_one_length(DEFAULT_CONFIG, overrides)
-    limit = None if within is None else read_amount("--within", within, parse_seconds)
-    options = SweepOptions(scene, seeds, overrides, steps, device, limit, numbers("--gpus", gpus))
-    return commands.ablate(ablations, options, out, only, psnr)
+    choice = CellChoice(scene, seeds, only, overrides, steps, device)
+    failures = run_study(load_ablation(name), choice, out, gpus)
+    for failure in failures:
+        print(f"failed  {failure.key}: {failure.reason}")
+    return 1 if failures else 0
 
 
-def compare(
-    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN RUN ...")], /, *, out: Path, psnr: Decibels = ()
+def report(
+    paths: Annotated[Positional[tuple[Path, ...]], arg(metavar="STUDY ... | RUN RUN ...")],
+    /,
+    *,
+    out: Path | None = None,
+    psnr: Decibels = (),
 ) -> int:
-    """Report any runs side by side; runs that were asked the same, but for the seed, count as one variant.
+    """Write the reports of studies again, from their results.json; or a report of runs side by side, where runs that
+    were asked the same, but for the seed, count as one variant.
 
     Args:
-        runs: folders of runs; the first one is what the others are compared with.
-        out: new folder for the report.
-        psnr: test PSNRs whose time is asked for; from the first run's result where absent.
+        paths: folders of studies; or folders of two runs or more, the first of which the others are compared with.
+        out: new folder for the report of runs.
+        psnr: test PSNRs whose time is asked for; from the baseline's result where absent.
     """
-    from turbogs_plugin.study import commands
+    from turbogs_plugin.study.results import StudyFolder
+    from turbogs_plugin.study.runs import study_of_runs
+    from turbogs_plugin.study.study_report import write_report
 
-    if len(runs) < 2:
-        raise InputError("compare needs RUN RUN ...: folders of two runs or more")
     require_positive("--psnr", psnr)
-    return commands.compare(runs, out, psnr)
-
-
-def report(studies: Positional[Studies], /, *, psnr: Decibels = ()) -> int:
-    """Write the report of studies again, from their results.json. A plot whose data did not change is left as it is.
-
-    Args:
-        studies: folders of studies.
-        psnr: test PSNRs whose time is asked for; those of the last report where absent.
-    """
-    from turbogs_plugin.study import commands
-
-    if not studies:
-        raise InputError("report needs STUDY ...: folders of studies")
-    require_positive("--psnr", psnr)
-    return commands.report(studies, psnr)
-
-
-def numbers(option: str, text: str | None) -> tuple[int, ...]:
-    """``0,1,2`` as numbers; none where the option is absent."""
-    words = [] if text is None else text.split(",")
-    if not all(word.strip().isdecimal() for word in words) or len({int(word) for word in words}) < len(words):
-        raise InputError(f"{option} '{text}': write different numbers with commas between them: 0,1,2")
-    return tuple(map(int, words))
+    if not paths:
+        raise InputError("report needs STUDY ..., folders of studies, or RUN RUN ... --out NEW, folders of runs")
+    folders = [StudyFolder(path) for path in paths]
+    if out is not None:
+        if len(paths) < 2:
+            raise InputError("report --out compares runs: give it the folders of two runs or more")
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise InputError(f"--out '{out}' is there and not empty: choose a new folder")
+        folders = [StudyFolder(out)]
+        folders[0].write_study(study_of_runs(paths))
+    for folder in folders:
+        if not folder.read_study().results:
+            raise InputError(f"'{folder.path}' has no finished cells to report on: go on with turbogs ablate")
+        print(f"report  {write_report(folder, psnr)}")
+    return 0

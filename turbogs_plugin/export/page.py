@@ -21,6 +21,7 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.camera_path import focus_and_up
 from turbogs_plugin.export.contribution import contributions, pruned
+from turbogs_plugin.export.document import CSS, Block, Heading, Paragraph, Table
 from turbogs_plugin.export.fidelity import Change, Fidelity
 from turbogs_plugin.export.packing import PackedModel, pack, unpack
 from turbogs_plugin.files import write_text_atomically
@@ -29,7 +30,6 @@ from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, error_picture, to_u
 from turbogs_plugin.report.plots import plot_against_seconds
 from turbogs_plugin.report.tables import ERRORS, errors, history_rows, number
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.study.document import CSS, Block, Heading, Paragraph, Table
 from turbogs_plugin.train.evaluate import compare
 from turbogs_plugin.train.history import Evaluation, read_history
 from turbogs_plugin.train.saved_model import SavedModel

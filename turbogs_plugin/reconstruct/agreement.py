@@ -21,18 +21,14 @@ from dataclasses import dataclass
 import numpy as np
 
 STRONGEST = 10
-"""Of each photo, so many pairs with the most matches are its evidence. They see the same place. The others, which a
-large capture has many times as many of, may see the same pattern only ..."""
+"""Pairs of each photo with the most matches, which count fully: they see the same place. Other pairs, of which a large
+capture has many times as many, may share no more than a pattern."""
 WEAK = 1e-3
-"""... and count so much: they decide where there is no other evidence."""
+"""Weight of all other pairs: they decide where there is no other evidence."""
 POWER = 1.5
-"""Of the number of matches in a pair's weight: above 1, since pairs that see the same place have more matches."""
+"""Exponent of the number of matches in a pair's weight: above 1, since pairs that see the same place have more."""
 DOUBT = 2.0
-"""A group is named as doubtful where what contradicts, times this, outweighs what agrees."""
-FEWEST_LINKS = 30
-"""Photos hold together where a pair agrees by so many matches: COLMAP registers a photo by no fewer points. And ..."""
-LINK_SHARE = 0.15
-"""... by this share of what the strongest pair of a photo has, as the median."""
+"""Factor of contradicting matches by which a group becomes doubtful, and is named."""
 
 
 @dataclass(frozen=True)
@@ -60,39 +56,21 @@ def consistent_groups(agreement: Agreement, doubt: float = 1.0) -> list[list[int
     """Photos in groups that the matches hold together, the largest group first.
 
     Args:
-        doubt: what contradicts counts so many times. With 1, groups are apart where between them the contradicting
-            matches outweigh the agreeing ones.
+        doubt: factor of contradicting matches. With 1, groups are apart where between them the contradicting matches
+            outweigh the agreeing ones.
 
     Returns:
-        Ascending indices of photos. All photos in one group: nothing contradicts the solve by majority.
+        Ascending indices of photos. All photos in one group: no majority contradicts the solve.
     """
     weights = agreement.agreeing**POWER - doubt * agreement.contradicting**POWER
     weights[~_strongest(agreement)] *= WEAK
     return _contracted(len(agreement.names), agreement.pairs, weights)
 
 
-def linked_groups(agreement: Agreement) -> list[list[int]]:
-    """Photos in groups that are connected by pairs with `fewest_links` agreeing matches, the largest group first."""
-    strong = agreement.agreeing >= fewest_links(agreement)
-    return _contracted(len(agreement.names), agreement.pairs[strong], np.ones(int(strong.sum())))
-
-
-def fewest_links(agreement: Agreement) -> int:
-    """Agreeing matches of a pair by which two photos hold together.
-
-    A group that is held to the others by weaker pairs alone may be at a ghost though nothing contradicts it: where the
-    photos between were not taken, repeated structure may be all that there is.
-    """
-    strongest = np.zeros(len(agreement.names))
-    for photos in agreement.pairs.T:
-        np.maximum.at(strongest, photos, agreement.agreeing)
-    return max(FEWEST_LINKS, round(LINK_SHARE * float(np.median(strongest))))
-
-
 def ghost_pairs(agreement: Agreement, groups: list[list[int]]) -> np.ndarray:
     """[P] bool: pairs that agree with the solve, between groups that more matches say are elsewhere.
 
-    These are what the solve went by when it put the groups in their places.
+    The solve went by these pairs when it put the groups in their places.
     """
     group = np.zeros(len(agreement.names), dtype=np.int64)
     for number, members in enumerate(groups):

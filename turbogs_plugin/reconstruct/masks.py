@@ -35,12 +35,11 @@ class MaskFile:
 
 
 def find_photo_masks(folder: Path, place: Path, photos: Sequence[PhotoFile]) -> list[MaskFile]:
-    """The masks of photos: those that `find_masks` of a capture finds, in a folder of masks in `folder`, in that of the
-    photos or beside it.
+    """Masks of photos, in a folder of masks in `folder`, in the photos' folder or beside it.
 
     Args:
-        folder: that the user gave.
-        place: that the photos' paths begin with.
+        folder: as the user gave it.
+        place: folder that the photos' paths begin with.
 
     Raises:
         InputError: a mask that is no image, or has not its photo's size.
@@ -66,10 +65,10 @@ def find_photo_masks(folder: Path, place: Path, photos: Sequence[PhotoFile]) -> 
 
 
 def place_masks(masks: Sequence[MaskFile], folder: Path, listed: Path) -> None:
-    """Put masks into a folder, in the place of those that an earlier call put there. What others put there stays.
+    """Put masks into a folder, and take away what an earlier call put there. Masks that others put there stay.
 
     Args:
-        listed: file with the names of those that calls put there.
+        listed: file with the names of the masks that calls put there.
     """
     names = [mask.name for mask in masks]
     before = (read_text(listed) or "").splitlines()

@@ -1,99 +1,76 @@
-"""Which pairs of photos are matched: all, or by place, by order and by likeness where they are many."""
+"""Pairs of photos to match: all of few photos; of many, those that are close by GPS or by order."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import PurePosixPath
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 FEW = 150
-"""So many photos are matched each with each other: 11,175 pairs."""
-OVERLAP = 10
-FURTHER = (16, 32, 64, 128, 256, 512)
-"""Ordered photos are matched with so many that follow, and with those so much further on."""
-LOOPS, ALIKE = 20, 50
-"""So many of the most similar photos are matched with each: beside another choice, and alone."""
+"""Up to this many photos, every pair is matched (11,175)."""
+FURTHER = (*range(1, 11), 16, 32, 64, 128, 256, 512)
+"""Distances, in the order of names, at which ordered photos are matched."""
+ANCHORS = 10
+"""One of this many ordered photos is matched with each other such one: so a walk that comes back is closed."""
 NEIGHBORS = 40
-"""Photos with a GPS position are matched with so many of the nearest."""
-GPS_SHARE = 0.9
-"""GPS is used where so many photos have it ..."""
-GPS_SPREAD = 50.0
-"""... and the standard deviation of their positions is so many metres, beside which the error of a phone is small."""
-ORDERED_SHARE = 0.9
-LARGEST_STEP = 10
-"""Photos are ordered where so many follow each other by a number that grows by at most this."""
+"""Nearest photos by GPS that each photo is matched with."""
+GPS_SHARE, GPS_SPREAD = 0.9, 50.0
+"""GPS is used where at least this share of the photos has it, and the standard deviation of their positions is at
+least this many metres: well above a phone's error."""
+ORDERED_SHARE, LARGEST_STEP = 0.9, 10
+"""Photos are ordered where at least this share of them follows another one by a number that grows by at most this."""
 EARTH_RADIUS = 6_371_000.0
 NUMBER = re.compile(r"^(.*?)(\d+)(\D*)$", re.DOTALL)
 
 
-@dataclass(frozen=True)
-class Matching:
-    """Pairs to match.
-
-    Args:
-        pairs: [P, 2] int64, indices of photos, the lower first, each pair once.
-        similar: match each photo also with so many that look most alike; 0: none.
-        reason: which pairs these are, and why, for the user.
-    """
-
-    pairs: np.ndarray
-    similar: int
-    reason: str
-
-
-def choose_matching(names: Sequence[str], positions: np.ndarray) -> Matching:
-    """The pairs for these photos.
+def choose_pairs(names: Sequence[str], positions: np.ndarray) -> tuple[np.ndarray, str]:
+    """Pairs to match, [P, 2] int64, indices of photos, the lower first, each pair once; and why these, for the user.
 
     Args:
         names: of V photos.
         positions: [V, 2] float64, degrees of latitude and longitude; NaN where a photo has none.
     """
     count = len(names)
+    every = np.stack(np.triu_indices(count, 1), axis=1)
     if count <= FEW:
-        return Matching(np.stack(np.triu_indices(count, 1), axis=1), 0, f"each with each, as they are at most {FEW}")
+        return every, f"each with each, as they are at most {FEW}"
     order = natural_order(names)
-    ordered = are_ordered([names[view] for view in order])
-    following = order[sequential_pairs(count)] if ordered else np.zeros((0, 2), dtype=np.int64)
+    pairs, reasons = [], []
     metres = metres_of(positions)
     placed = np.isfinite(metres).all(axis=1)
     if placed.mean() >= GPS_SHARE and np.sqrt(metres[placed].var(axis=0).sum()) >= GPS_SPREAD:
-        pairs = _distinct(np.concatenate([nearest_pairs(metres), following]))
-        also = f", {OVERLAP} that follow" if ordered else ""
-        return Matching(pairs, LOOPS, f"with {NEIGHBORS} nearest by GPS{also} and {LOOPS} most similar")
-    if ordered:
-        return Matching(_distinct(following), LOOPS, f"in the order of their names, and with {LOOPS} most similar")
-    return Matching(following, ALIKE, f"with {ALIKE} most similar, as neither names nor GPS say which are close")
-
-
-def sequential_pairs(count: int) -> np.ndarray:
-    """[P, 2] int64: each with the `OVERLAP` that follow, and with those at distances of `FURTHER`."""
-    starts = {step: np.arange(max(0, count - step)) for step in (*range(1, OVERLAP + 1), *FURTHER)}
-    return np.concatenate([np.stack([start, start + step], axis=1) for step, start in starts.items()])
+        pairs.append(nearest_pairs(metres))
+        reasons.append(f"with the {NEIGHBORS} nearest by GPS")
+    if are_ordered([names[view] for view in order]):
+        starts = {step: np.arange(max(0, count - step)) for step in FURTHER}
+        pairs += [order[np.stack([start, start + step], axis=1)] for step, start in starts.items()]
+        anchors = order[::ANCHORS]
+        pairs.append(anchors[np.stack(np.triu_indices(len(anchors), 1), axis=1)])
+        reasons.append("in the order of their names")
+    if not pairs:
+        return every, "each with each, as neither names nor GPS say which are close"
+    return _distinct(np.concatenate(pairs)), " and ".join(reasons)
 
 
 def nearest_pairs(positions: np.ndarray) -> np.ndarray:
-    """[P, 2] int64: each of the [V, 2] positions with the `NEIGHBORS` nearest; those with NaN with none."""
+    """[P, 2] int64: each of the [V, 2] positions with the `NEIGHBORS` nearest; positions with NaN with none."""
     placed = np.flatnonzero(np.isfinite(positions).all(axis=1))
-    pairs = []
-    for view in placed:
-        distances = np.linalg.norm(positions[placed] - positions[view], axis=1)
-        nearest = placed[np.argsort(distances, kind="stable")[: NEIGHBORS + 1]]
-        pairs += [(view, other) for other in nearest if other != view]
-    return _distinct(np.array(pairs, dtype=np.int64).reshape(-1, 2))
+    count = min(NEIGHBORS + 1, len(placed))
+    _, nearest = cKDTree(positions[placed]).query(positions[placed], k=count)  # [., count]
+    pairs = np.stack([np.repeat(placed, count), placed[nearest].ravel()], axis=1)
+    return _distinct(pairs[pairs[:, 0] != pairs[:, 1]])
 
 
 def metres_of(positions: np.ndarray) -> np.ndarray:
     """[V, 2] metres north and east of the median, of [V, 2] degrees of latitude and longitude. NaN stays NaN."""
-    placed = np.isfinite(positions).all(axis=1)
-    if not placed.any():
+    if not np.isfinite(positions).any():
         return positions
-    middle = np.median(positions[placed], axis=0)
-    scale = EARTH_RADIUS * np.array([1.0, np.cos(np.radians(middle[0]))])
-    return np.radians(positions - middle) * scale
+    middle = np.nanmedian(positions, axis=0)
+    return np.radians(positions - middle) * EARTH_RADIUS * np.array([1.0, np.cos(np.radians(middle[0]))])
 
 
 def natural_order(names: Sequence[str]) -> np.ndarray:
@@ -103,7 +80,7 @@ def natural_order(names: Sequence[str]) -> np.ndarray:
 
 
 def are_ordered(names: Sequence[str]) -> bool:
-    """Whether names in natural order are those of a walk or a film: numbers that grow by small steps."""
+    """Whether names in natural order are a walk's or a film's: numbers that grow by small steps."""
     parts = [NUMBER.match(PurePosixPath(name).with_suffix("").as_posix()) for name in names]
     follows = [
         first is not None

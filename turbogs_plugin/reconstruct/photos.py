@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import shutil
@@ -12,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from PIL import Image, ImageOps
+from PIL import ImageOps
 from PIL.ExifTags import IFD, Base
 
 from turbogs_plugin.errors import InputError
@@ -24,11 +23,11 @@ from turbogs_plugin.scene.photos import decoding_threads, opened_image, require_
 
 SEPARATORS = re.compile(r"[\s#]")
 FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "BMP")
-"""That COLMAP reads, whatever the file's suffix is; MPO is a JPEG with a second one behind it, of phones."""
+"""Image formats that COLMAP reads, by content. MPO: a phone's JPEG with a second picture appended."""
 KEPT_EXIF = (Base.Make, Base.Model, IFD.Exif, IFD.GPSInfo)
-"""Of copies that are turned upright: what COLMAP reads."""
+"""EXIF entries that copies which are turned upright keep: what COLMAP reads."""
 JPEG_QUALITY = 95
-"""Of copies that are turned upright. Photos that are upright already stay bit for bit."""
+"""Quality of copies that are turned upright. Photos that are upright already stay bit for bit."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,6 @@ class PhotoFile:
         size: (width, height) of the upright photo.
         turned: EXIF says that the file is not upright.
         lens: photos of the same lens have the same text: camera, focal length and size.
-        position: degrees of latitude and longitude, NaN where EXIF has none.
         stamp: bytes and time of the last change in ns, by which a later call knows the file again.
     """
 
@@ -50,7 +48,6 @@ class PhotoFile:
     size: tuple[int, int]
     turned: bool
     lens: str
-    position: tuple[float, float]
     stamp: tuple[int, int]
 
 
@@ -139,36 +136,15 @@ def _read(path: Path, name: str) -> PhotoFile:
     orientation = exif.get(Base.Orientation, 1)
     turned = orientation in range(2, 9)
     upright = size[::-1] if orientation in range(5, 9) else size
-    details = _ifd(exif, IFD.Exif)
+    try:
+        details = dict(exif.get_ifd(IFD.Exif))
+    except Exception:  # damaged, and nothing in EXIF is needed
+        details = {}
     focal = (details.get(Base.FocalLength, ""), details.get(Base.FocalLengthIn35mmFilm, ""))
     lens = " ".join(
         str(part).strip("\0 ") for part in (exif.get(Base.Make, ""), exif.get(Base.Model, ""), *focal, *upright)
     )
-    stamp = (status.st_size, status.st_mtime_ns)
-    return PhotoFile(name, path, upright, turned, lens, _position(_ifd(exif, IFD.GPSInfo)), stamp)
-
-
-def _ifd(exif: Image.Exif, tag: int) -> dict[int, Any]:
-    """A part of the EXIF data; empty where it is absent or damaged."""
-    try:
-        return dict(exif.get_ifd(tag))
-    except Exception:  # nothing in EXIF is needed
-        return {}
-
-
-def _position(gps: dict[int, Any]) -> tuple[float, float]:
-    """Degrees of latitude and longitude, or NaN."""
-
-    def degrees(reference: int, negative: str) -> float:
-        whole, minutes, seconds = (float(part) for part in gps[reference + 1])
-        return (whole + minutes / 60 + seconds / 3600) * (-1 if str(gps[reference]).strip("\0 ") == negative else 1)
-
-    try:
-        position = degrees(1, "S"), degrees(3, "W")
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
-        return math.nan, math.nan
-    # (0, 0) is what devices without a fix write.
-    return position if all(map(math.isfinite, position)) and position != (0.0, 0.0) else (math.nan, math.nan)
+    return PhotoFile(name, path, upright, turned, lens, (status.st_size, status.st_mtime_ns))
 
 
 def _write_upright(source: Path, target: Path) -> None:
@@ -178,12 +154,16 @@ def _write_upright(source: Path, target: Path) -> None:
         exif = image.getexif()
         image.info.pop("exif", None)  # `exif_transpose` would write it again, which Pillow cannot always
         upright = ImageOps.exif_transpose(image)
-    for tag in set(exif).difference(KEPT_EXIF):  # those of a TIFF say how its pixels are stored
+    for tag in set(exif).difference(KEPT_EXIF):  # a TIFF's say how its pixels are stored
         del exif[tag]
-    options = {"JPEG": {"quality": JPEG_QUALITY, "subsampling": 0}, "TIFF": {"compression": "raw"}}.get(form, {})
+    known: dict[str, dict[str, Any]] = {
+        "JPEG": {"quality": JPEG_QUALITY, "subsampling": 0},
+        "TIFF": {"compression": "raw"},
+    }
+    options = known.get(form or "", {})
     if "icc_profile" in upright.info:
         options["icc_profile"] = upright.info["icc_profile"]
     try:
         upright.save(target, format=form, exif=exif, **options)
-    except Exception:  # nothing in EXIF is needed, and Pillow cannot write all that it reads
+    except Exception:  # Pillow cannot write all EXIF that it reads, and nothing in it is needed
         upright.save(target, format=form, **options)

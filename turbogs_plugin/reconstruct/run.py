@@ -2,48 +2,73 @@
 
 from __future__ import annotations
 
+import errno
+import json
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
+from filelock import FileLock, Timeout
 
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import read_text, require_writable, write_text_atomically
 from turbogs_plugin.reconstruct import solver
 from turbogs_plugin.reconstruct.agreement import (
     DOUBT,
     Agreement,
     consistent_groups,
-    fewest_links,
     ghost_pairs,
-    linked_groups,
 )
-from turbogs_plugin.reconstruct.effort import DEFAULTS, DOUBLED, QUICK, efforts_for
 from turbogs_plugin.reconstruct.masks import find_photo_masks, place_masks
-from turbogs_plugin.reconstruct.matching import FEW, Matching, choose_matching
-from turbogs_plugin.reconstruct.photos import PhotoFile, place_photos, read_photos
-from turbogs_plugin.reconstruct.workspace import Solution, Workspace
+from turbogs_plugin.reconstruct.matching import FEW, choose_pairs
+from turbogs_plugin.reconstruct.photos import PhotoFile, list_photos, place_photos, read_photos
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS, named
 from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.scene.mask_files import misnamed
 from turbogs_plugin.scene.photo_folder import find_photos, unread
+from turbogs_plugin.scene.photos import photo_sizes, reduced_sizes
 
 if TYPE_CHECKING:
     import pycolmap
 
+SMALL = 1000
+"""Photos whose longer side is shorter, in px, show too little without features at twice their size."""
 ENOUGH_OF_MANY = 0.95
-"""Of more than `FEW` photos so many are enough; of fewer, all."""
-REPAIRS = 3
-"""So many times a solve with ghosts is repeated without the pairs that made them."""
+"""Share of more than `FEW` photos that is enough; of fewer, all must register, or more features are looked for."""
 SMALLEST_SHARE = 0.5
 """A model with a smaller share of the photos is not taken for the scene."""
-MATCHING_SHARE = 0.5
-"""Where so many pairs match and yet no camera is found, it is not for want of overlap."""
 NAMED_AT_MOST = 10
-_listed = partial(named, most=NAMED_AT_MOST)
+REMEDY = (
+    "take sharp photos that overlap by two thirds with their neighbours, of one scene, from different places, not by "
+    "turning in one place"
+)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a reconstruction came to.
+
+    Args:
+        scene: the capture's folder: ``images`` and ``sparse/0``.
+        photos, registered, points: their numbers.
+        left_out: names of the photos that are not in the model.
+        notes: lines for the user.
+    """
+
+    scene: Path
+    photos: int
+    registered: int
+    points: int
+    left_out: list[str]
+    notes: list[str]
+
+    def text(self) -> str:
+        return "\n".join([*self.notes, f"scene  {self.scene}"])
 
 
 @dataclass(frozen=True)
@@ -64,7 +89,7 @@ class Solve:
 
     @property
     def placed(self) -> int:
-        """Photos in the place that most matches say."""
+        """Number of photos in the place that most matches say."""
         return len(self.groups[0])
 
     @property
@@ -81,8 +106,8 @@ class Solve:
 def reconstruct(photos: Path, out: Path) -> Solution:
     """Find the cameras of photos, and write a COLMAP capture: ``images`` and ``sparse/0``.
 
-    A call for the same photos goes on where an earlier one was stopped. A finished one is told again. Masks of the
-    photos go with them, as they are now.
+    A call for photos of an earlier call that was stopped repeats no features and matches; a finished reconstruction is
+    told again. Masks of the photos go with them, as they are now.
 
     Args:
         photos: a folder of photos, or a folder whose ``images`` are.
@@ -91,7 +116,6 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     Raises:
         InputError: photos or folder are not usable, or the photos cannot be solved. Then what this call began is gone.
         OSError: the disk is full; what was finished is kept.
-        KeyboardInterrupt: what was finished is kept.
     """
     load_pycolmap()  # where it is absent, that is said before photos are read
     found = read_photos(photos)
@@ -99,18 +123,18 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     if place.resolve() in (out.resolve(), *out.resolve().parents):
         raise InputError(f"the scene '{out}' would lie among the photos of '{place}': choose an --out elsewhere")
     masks = find_photo_masks(photos, place, found)
-    workspace = Workspace(out)
     missing = [parent for parent in (out, *out.parents) if not parent.exists()]
-    new = workspace.begin(found)
+    scratch = out / "reconstruction"
+    new = _begin(found, out, scratch / "photos.json")
     unused = "" if masks else misnamed(dict.fromkeys((photos, place.parent, place)))
-    with workspace.held():
-        place_masks(masks, workspace.masks, workspace.masked)
+    with _held(scratch):
+        place_masks(masks, out / "masks", scratch / "masks.txt")
         try:
-            solution = workspace.read_solution() or _reconstruct(found, workspace, unread(photos))
+            solution = _read_solution(out) or _reconstruct(found, out, unread(photos))
         except InputError:
             if new:
-                shutil.rmtree(missing[-1] if missing else workspace.scratch, ignore_errors=True)
-                for folder in (workspace.images, workspace.masks):
+                shutil.rmtree(missing[-1] if missing else scratch, ignore_errors=True)
+                for folder in (out / "images", out / "masks"):
                     shutil.rmtree(folder, ignore_errors=True)
             raise
     return replace(solution, notes=[*solution.notes, unused]) if unused else solution
@@ -123,79 +147,123 @@ def scene_beside(photos: Path, run: Path) -> Path:
     return run.absolute().parent / f"{name}-scene"
 
 
-def _reconstruct(photos: Sequence[PhotoFile], workspace: Workspace, others: str) -> Solution:
-    """`others`: files beside the photos that are not read, for a note."""
-    workspace.images.mkdir(exist_ok=True)
-    place_photos(photos, workspace.images)
+def reconstruct_beside(config: Config, run: Path) -> Path:
+    """Find the cameras of a capture of photos alone (`holds_photos_alone`) for a run; folder of the reconstruction.
+
+    Raises:
+        InputError: the photos cannot be solved, or are too small for the factor.
+    """
+    photos = Path(config.scene.path)
+    _, paths = list_photos(photos)  # too few are refused before anything is said
+    if config.scene.factor > 1:
+        reduced_sizes(photo_sizes(paths), config.scene.factor)  # as is a factor that is too large
+    scene = scene_beside(photos, run)
+    print(f"{photos} has photos alone: their cameras are found first, into {scene}", file=sys.stderr, flush=True)
+    print("\n".join(reconstruct(photos, scene).notes), file=sys.stderr, flush=True)
+    return scene
+
+
+def _begin(photos: Sequence[PhotoFile], out: Path, listed: Path) -> bool:
+    """Make the folder of a scene and list its photos, or see that an earlier call listed the same; whether it is new.
+
+    Raises:
+        InputError: the folder holds something else, or a reconstruction of other photos.
+    """
+    text = json.dumps({photo.name: photo.stamp for photo in photos}, indent=1)
+    known = read_text(listed)
+    if known is not None and known != text:
+        raise InputError(f"'{out}' was begun with other photos, or they changed: choose a new --out, or delete it")
+    if known is None:
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise InputError(f"--out '{out}' holds something else: choose a new folder")
+        require_writable(out, f"--out '{out}'")
+        listed.parent.mkdir(parents=True)
+        write_text_atomically(listed, text)
+    return known is None
+
+
+@contextmanager
+def _held(scratch: Path) -> Iterator[None]:
+    """While entered, no other process makes the scene; the system frees the lock of a process that is killed."""
+    lock = FileLock(scratch / "lock")
+    try:
+        lock.acquire(timeout=0 if _read_solution(scratch.parent) is None else -1)  # a finished one takes moments
+    except Timeout:
+        raise InputError(f"'{scratch.parent}' is being made by another process: wait for it") from None
+    with lock:
+        yield
+
+
+def _read_solution(out: Path) -> Solution | None:
+    """What an earlier call came to; None where none was finished."""
+    text = read_text(out / "reconstruction" / "solution.json")
+    return Solution(out, **json.loads(text)) if text and (out / "sparse" / "0").is_dir() else None
+
+
+def _reconstruct(photos: Sequence[PhotoFile], out: Path, others: str) -> Solution:
+    """Solve the photos and write the scene. `others`: files beside the photos that are not read, for a note."""
+    scratch, images = out / "reconstruction", out / "images"
+    images.mkdir(exist_ok=True)
+    place_photos(photos, images)
     names = [photo.name for photo in photos]
-    matching = choose_matching(names, np.array([photo.position for photo in photos]))
-    longest = max(max(photo.size) for photo in photos)
     enough = len(photos) if len(photos) <= FEW else ENOUGH_OF_MANY * len(photos)
     best: Solve | None = None
-    repaired: list[str] = []
-    efforts = efforts_for(longest)
-    for effort in efforts:
-        database = workspace.database(effort)
-        if effort is DEFAULTS and longest <= DOUBLED.long_side:  # the features are the same
-            solver.with_default_cameras(workspace.database(DOUBLED), database)
-        else:
-            solver.extract_features(database, workspace.images, photos, effort)
-            if not solver.read_names(database):
-                if effort is QUICK:
-                    continue
-                raise InputError(
-                    f"none of the {len(photos)} photos shows anything that could be found again in another one: they "
-                    "are blank, blurred or too small; take sharp photos of a scene with texture"
-                )
-            solver.match_features(database, workspace.scratch, names, matching)
-        solve, moved = _solve(database, workspace, effort.again if effort is not efforts[0] else "")
+    moved, said = [], "no photo shows anything that could be found again in another one: take sharp photos with texture"
+    small = max(max(photo.size) for photo in photos) < SMALL
+    for doubled in (True,) if small else (False, True):
+        database = scratch / f"features{'-doubled' * doubled}.db"
+        solver.extract_features(database, images, photos, doubled)
+        if not solver.count_features(database):
+            continue
+        pairs, reason = choose_pairs(names, solver.read_positions(database, names))
+        solver.match_features(database, scratch, [(names[first], names[second]) for first, second in pairs.tolist()])
+        matched = solver.count_verified_pairs(database)
+        said = f"{matched:,} of {len(pairs):,} pairs of photos match"
+        solve, repaired = _solve(database, images, scratch)
         if solve is not None and (best is None or solve.rank > best.rank):
-            best, repaired, verified = solve, moved, solver.count_verified_pairs(database)
+            best, moved = solve, repaired
+            note = f"{_photos(len(photos))} matched {reason}: {matched:,} pairs show the same"
         if best is not None and best.placed >= enough:
             break
-    _require_solved(best, len(photos), solver.count_verified_pairs(database), matching)
-    _leave_out(best.model, best.ghosts)
-    registered = {image.name for image in best.model.images.values() if image.has_pose}
+    if best is None:
+        raise InputError(f"no cameras were found for {len(photos)} photos: {said}; {REMEDY}")
+    if best.placed < max(FEWEST_PHOTOS, SMALLEST_SHARE * len(photos)):
+        sizes = ", ".join(map(str, best.sizes[:NAMED_AT_MOST]))
+        raise InputError(f"only {best.placed} of {len(photos)} photos connect (models of {sizes} photos): {REMEDY}")
+    model, ghosts = best.model, set(best.ghosts)
+    for frame in {image.frame_id for image in model.images.values() if image.name in ghosts}:
+        model.deregister_frame(frame)
+    registered = {image.name for image in model.images.values() if image.has_pose}
     left_out = [name for name in names if name not in registered]
     notes = [f"not used: {others}"] if others else []
-    notes += _notes(photos, matching, verified, best, repaired, left_out)
-    counts = len(photos), len(registered), best.model.num_points3D()
-    solution = Solution(workspace.scene, *counts, left_out, notes)
-    workspace.finish(best.model, solution)
-    return solution
+    notes += [note, *_notes(best, len(photos), moved, left_out)]
+    _write_model(model, out / "sparse", scratch)
+    result = Solution(out, len(photos), len(registered), model.num_points3D(), left_out, notes)
+    kept = {name: value for name, value in asdict(result).items() if name != "scene"}  # which may be moved
+    write_text_atomically(scratch / "solution.json", json.dumps(kept, indent=1))
+    return result
 
 
-def _solve(database: Path, workspace: Workspace, again: str = "") -> tuple[Solve | None, list[str]]:
-    """The best solve of a database, and the photos that a repair has moved. `again`: as in `solve_cameras`."""
-    best = _attempt(database, database, workspace, again)
-    if best is None:
-        return None, []
-    first, removed = best, set()
-    working = workspace.scratch / "working.db"
-    solve = best
-    for _ in range(REPAIRS):
-        if len(solve.groups) == 1:
-            break
-        agreement = solve.agreement
-        ghostly = agreement.pairs[ghost_pairs(agreement, solve.groups)]
-        pairs = {(agreement.names[one], agreement.names[other]) for one, other in ghostly.tolist()}
-        if pairs <= removed:
-            break
-        removed |= pairs
-        solver.without_pairs(database, working, sorted(removed))
-        solve = _attempt(working, database, workspace, " again, without the pairs that led to a ghost")
-        if solve is None:
-            break
-        if solve.rank > best.rank:
-            best = solve
+def _solve(database: Path, images: Path, scratch: Path) -> tuple[Solve | None, list[str]]:
+    """The best solve of a database, and the photos that a repair has moved: where the first solve has ghosts, it is
+    repeated once without the pairs that made them."""
+    first = _attempt(database, database, images, scratch)
+    if first is None or len(first.groups) == 1:
+        return first, []
+    agreement, working = first.agreement, scratch / "working.db"
+    ghostly = agreement.pairs[ghost_pairs(agreement, first.groups)].tolist()
+    solver.without_pairs(database, working, [(agreement.names[one], agreement.names[other]) for one, other in ghostly])
+    second = _attempt(working, database, images, scratch)
     working.unlink(missing_ok=True)
-    placed = {best.agreement.names[view] for view in best.groups[0]}
-    return best, [name for name in first.ghosts if name in placed] if best is not first else []
+    if second is None or second.rank <= first.rank:
+        return first, []
+    placed = {second.agreement.names[view] for view in second.groups[0]}
+    return second, [name for name in first.ghosts if name in placed]
 
 
-def _attempt(database: Path, evidence: Path, workspace: Workspace, again: str) -> Solve | None:
-    """A solve of a database, judged by all the matches of another. `again`: as in `solve_cameras`."""
-    models = solver.solve_cameras(database, workspace.images, workspace.scratch, again)
+def _attempt(database: Path, evidence: Path, images: Path, scratch: Path) -> Solve | None:
+    """A solve of a database, judged by all the matches of another."""
+    models = solver.solve_cameras(database, images, scratch)
     if not models or models[0].num_reg_images() < FEWEST_PHOTOS:
         return None
     agreement = solver.measure_agreement(models[0], evidence)
@@ -203,86 +271,44 @@ def _attempt(database: Path, evidence: Path, workspace: Workspace, again: str) -
     return Solve(models[0], sizes, agreement, consistent_groups(agreement))
 
 
-def _leave_out(model: pycolmap.Reconstruction, names: Sequence[str]) -> None:
-    """Take photos out of a model."""
-    wanted = set(names)
-    for frame in {image.frame_id for image in model.images.values() if image.name in wanted}:
-        model.deregister_frame(frame)
+def _write_model(model: pycolmap.Reconstruction, sparse: Path, scratch: Path) -> None:
+    """Put the model in place, whole or not at all. Raises `OSError` where the disk is full, of which pycolmap says
+    nothing."""
+    part = scratch / "sparse"
+    for folder in (part, sparse, scratch / "models"):
+        shutil.rmtree(folder, ignore_errors=True)
+    (part / "0").mkdir(parents=True)
+    try:
+        model.write_binary(part / "0")
+        whole = load_pycolmap().Reconstruction(part / "0").num_points3D() == model.num_points3D()
+    except (RuntimeError, ValueError, IndexError):  # of a file that was cut
+        whole = False
+    if not whole:
+        raise OSError(errno.ENOSPC, "it cannot be written whole", str(sparse))
+    part.rename(sparse)
 
 
-def _require_solved(solve: Solve | None, photos: int, verified: int, matching: Matching) -> None:
-    """Raise `InputError`, with the numbers and the remedy, unless the solve has enough of the photos."""
-    remedy = "take photos that overlap by two thirds with their neighbours, of one scene, from different places"
-    if solve is None:
-        if verified >= MATCHING_SHARE * max(1, len(matching.pairs)) and len(matching.pairs):
-            raise InputError(
-                f"no cameras were found for {photos} photos: {verified:,} of {len(matching.pairs):,} pairs match, but "
-                "they show no depth, as photos from one place or copies of one photo do; move between the photos"
-            )
-        asked = f"of {len(matching.pairs):,} pairs of photos " if not matching.similar else "of pairs of photos "
-        sharp = "; sharp ones, not much smaller than a camera makes them"
-        raise InputError(f"no cameras were found for {photos} photos: {asked}{verified:,} match; {remedy}{sharp}")
-    if solve.placed >= max(FEWEST_PHOTOS, SMALLEST_SHARE * photos):
-        return
-    if len(solve.sizes) > 1:
-        sizes = ", ".join(map(str, solve.sizes[:NAMED_AT_MOST]))
-        raise InputError(
-            f"{photos} photos fall into {len(solve.sizes)} scenes that do not connect, of {sizes} photos: add photos "
-            "that lead from one to the other, or reconstruct the photos of each alone"
-        )
-    raise InputError(f"only {solve.placed} of {photos} photos connect ({verified:,} pairs match): {remedy}")
-
-
-def _notes(
-    photos: Sequence[PhotoFile], matching: Matching, verified: int, solve: Solve, repaired: list[str], lost: list[str]
-) -> list[str]:
+def _notes(solve: Solve, photos: int, moved: list[str], left_out: list[str]) -> list[str]:
+    """Lines for the user about a solve."""
     model, agreement = solve.model, solve.agreement
-    lenses = len({photo.lens for photo in photos})
-    turned = sum(photo.turned for photo in photos)
-    upright = f", {turned} turned upright by EXIF" if turned else ""
+    error = model.compute_mean_reprojection_error()
     notes = [
-        f"{len(photos)} photos of {lenses} {'lens' if lenses == 1 else 'lenses'}{upright}; matched {matching.reason}: "
-        f"{verified:,} pairs show the same",
-        f"{len(photos) - len(lost)} of {len(photos)} photos registered, {model.num_points3D():,} points, "
-        f"reprojection error {model.compute_mean_reprojection_error():.2f} px",
+        f"{photos - len(left_out)} of {photos} photos registered, {model.num_points3D():,} points, reprojection error "
+        f"{error:.2f} px"
     ]
-    if repaired:
-        notes.append(
-            f"{_photos(repaired)} at a ghost, as repeated structure misled the first solve; solved again without the "
-            f"pairs that put {_word(repaired, 'it', 'them')} there: {_listed(repaired)}"
-        )
-    if solve.ghosts:
-        notes.append(
-            f"{_photos(solve.ghosts)} left out, as more matches contradict {_word(solve.ghosts, 'its', 'their')} place "
-            f"than confirm it (repeated structure): {_listed(solve.ghosts)}"
-        )
-    if unplaced := [name for name in lost if name not in set(solve.ghosts)]:
-        smaller = solve.sizes[1:]
-        others = f", {len(smaller)} smaller {_word(smaller, 'model', 'models')} besides" if smaller else ""
-        notes.append(
-            f"{_photos(unplaced)} did not register{others}: {_listed(unplaced)}; add photos between "
-            f"{_word(unplaced, 'it', 'them')} and the others"
-        )
-    if contradicting := int(agreement.contradicts.sum()):
-        matches = agreement.agreeing.sum() + agreement.contradicting.sum()
-        notes.append(
-            f"{contradicting:,} of {len(agreement.pairs):,} pairs contradict the cameras, with "
-            f"{agreement.contradicting[agreement.contradicts].sum() / max(1, matches):.1%} of the matches"
-        )
-    main = {agreement.names[view] for view in solve.groups[0]}
-    for groups, reason in (
-        (consistent_groups(agreement, DOUBT), "which many matches contradict"),
-        (linked_groups(agreement), f"as no pair with the others has {fewest_links(agreement)} matches that agree"),
+    placed = {agreement.names[view] for view in solve.groups[0]}
+    doubtful = [agreement.names[view] for group in consistent_groups(agreement, DOUBT)[1:] for view in group]
+    unplaced = [name for name in left_out if name not in solve.ghosts]
+    for names, said in (
+        (moved, "moved, as repeated structure misled the first solve: solved again without the pairs that did"),
+        (solve.ghosts, "left out, as more matches contradict their place than confirm it (repeated structure)"),
+        (unplaced, "did not register: add photos between them and the others"),
+        ([name for name in doubtful if name in placed], "may be in a wrong place, which many matches contradict"),
     ):
-        doubtful = [name for group in groups[1:] for name in (agreement.names[view] for view in group) if name in main]
-        if doubtful:
-            notes.append(f"{_photos(doubtful)} may be in a wrong place, {reason}: {_listed(doubtful)}")
+        if names:
+            notes.append(f"{_photos(len(names))} {said}: {named(names, most=NAMED_AT_MOST)}")
     return notes
 
 
-def _photos(names: Sequence[str]) -> str:
-    return f"{len(names)} {_word(names, 'photo', 'photos')}"
-
-
-def _word(things: Sequence[object], one: str, more: str) -> str:
-    return one if len(things) == 1 else more
+def _photos(count: int) -> str:
+    return f"{count} photo{'s' * (count != 1)}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +16,7 @@ from turbogs_plugin.plan import make_plan
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
-from turbogs_plugin.study.results import CellResult
+from turbogs_plugin.study.results import CellResult, changes, curve_and_final, flat_settings, measured
 from turbogs_plugin.train.evaluate import evaluate, load_lpips
 from turbogs_plugin.train.evaluations import Evaluations
 from turbogs_plugin.train.flip import load_flip
@@ -28,13 +27,13 @@ from turbogs_plugin.train.wall import WallClock
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
 """Iterations of warm-up: the configuration is scaled to this length and trained once before the clock starts, so that
-the code of every kind of step is loaded. Once for a variant and capture in each process: what is loaded stays."""
+the code of every kind of step is loaded. One for a variant and capture in each process: what is loaded stays."""
 
 
 class PeakMemory(Listener):
     """Peak of the GPU's tensors while training, without what evaluations need; nothing on a CPU.
 
-    One process trains all cells, so a CPU's peak, which is the process's, would be that of the largest cell so far.
+    One process trains all cells, so a CPU's peak, which is the process's, would be the largest cell's so far.
 
     Attributes:
         peak: bytes; None on a CPU.
@@ -55,11 +54,10 @@ class PeakMemory(Listener):
 
 
 def capture_digest(scene: Scene) -> str:
-    """A digest that tells captures of the same name apart: of the photos' names, sizes, cameras and counts of unmasked
-    pixels, and the number of points.
+    """Digest that tells captures of one name apart: photos' names, sizes, cameras, unmasked pixels; number of points.
 
-    Pixels are not in it, for decoders of different versions give different ones. Of the cameras' coordinates it takes
-    four digits of a sum, for the last bits differ from machine to machine.
+    Pixels are not in it, for decoders of different versions give different ones. Cameras' coordinates count by four
+    digits of a sum, for the last bits differ from machine to machine.
     """
     digest = hashlib.sha256(str(len(scene.points)).encode())
     for part in (scene.train, scene.test):
@@ -85,23 +83,19 @@ def train_cell(
     scene: Scene,
     device: torch.device,
     made_by: Provenance,
-    listeners: Sequence[Listener] = (),
     loading: float = math.nan,
     warm: bool = False,
-    capture: str | None = None,
 ) -> CellResult:
-    """Train one variant, as `turbogs train` would: by a plan for the scene, within the budgets of the configuration.
+    """Train one variant, as `turbogs train` would: by a plan for the scene, within the configuration's budgets.
 
     Args:
         variant: its name.
-        config: as asked for. The result keeps this one and the resolved one.
+        config: as asked for.
         scene: in host memory; the plan says what of it goes to the device.
         device: where to train.
         made_by: machine and sources, as they were when the process began.
-        listeners: to the training.
-        loading: seconds that the scene took to load; NaN: the cell's own seconds are not known.
+        loading: seconds in which the scene was loaded; NaN: not known, and then the cell's own seconds are not.
         warm: this process has trained a cell of this variant on this capture.
-        capture: its digest; None: that of the scene.
 
     Raises:
         InputError: a budget is too small.
@@ -113,41 +107,41 @@ def train_cell(
     planned = make_plan(config, scene, device).apply(config)
     test = place_views(scene.test, device, planned.train.photos_place)
     clock.mark("cell")
-    warmup = min(WARMUP_ITERATIONS[device.type], planned.train.iterations)
     if not warm:
-        warm_up(planned, scene, test, device, warmup)
+        warm_up(planned, scene, test, device)
     clock.mark("warm-up")
     memory = PeakMemory(device)
     loop, _ = new_loop(planned, scene, device)
     evaluations = Evaluations(test, lpips, lambda: memory.peak or peak_memory_bytes(device))
-    loop.listeners = [evaluations, *listeners, memory]  # last, so that it forgets what the others needed, too
+    loop.listeners = [evaluations, memory]  # in this order, so that the peak forgets what evaluations needed
     loop.run()
     clock.mark("cell")
     trainer, mean_flip = loop.trainer, math.nan
     if flip is not None:  # off the clock
-        metrics = evaluate(trainer.gaussians, test, trainer.look(test.names), flip=flip)
-        mean_flip = metrics.mean.flip
+        mean_flip = evaluate(trainer.gaussians, test, trainer.look(test.names), flip=flip).mean.flip
+    curve, final = curve_and_final(evaluations.history)
+    if evaluations.metrics is not None:
+        final["lpips"], final["fps"] = evaluations.metrics.mean.lpips, evaluations.metrics.fps
+    final["flip"], final["cell_seconds"] = mean_flip, loading + clock.parts["cell"]
+    final["peak_mib"] = math.nan if memory.peak is None else memory.peak / 2**20
+    settings = flat_settings(config.to_mapping())
     return CellResult(
         scene=scene.name,
         variant=variant,
         seed=config.train.seed,
-        config=trainer.config.to_mapping(),
-        asked=config.to_mapping(),
-        history=evaluations.history,
-        lpips=evaluations.metrics.mean.lpips,
-        lpips_reason=lpips_reason,
-        flip=mean_flip,
-        cell_seconds=loading + clock.parts["cell"],
-        fps=evaluations.metrics.fps,
-        peak_bytes=memory.peak,
-        warmup_iterations=warmup,
+        capture=capture_digest(scene),
         provenance=made_by,
-        capture=capture_digest(scene) if capture is None else capture,
+        settings=settings,
+        planned=changes(settings, flat_settings(trainer.config.to_mapping())),
+        curve=curve,
+        final=measured(final),
+        lpips_reason=lpips_reason,
     )
 
 
-def warm_up(config: Config, scene: Scene, test: PosedImages, device: torch.device, iterations: int) -> None:
+def warm_up(config: Config, scene: Scene, test: PosedImages, device: torch.device) -> None:
     """Train and evaluate a model that is thrown away, with every kind of event that the configuration has."""
+    iterations = min(WARMUP_ITERATIONS[device.type], int(config.train.iterations))
     trainer = Trainer(with_iterations(config, iterations), scene, device)
     TrainingLoop(trainer).run()
     evaluate(trainer.gaussians, test, trainer.look(test.names))

@@ -1,6 +1,6 @@
-"""What an ablation is: named variants of a configuration, over scenes and seeds.
+"""Cells of a study: named variants of a configuration, over captures and seeds.
 
-A YAML in ``configs/ablations/``::
+An ablation is a YAML file, as those in ``configs/ablations/``::
 
     title: Optimizer
     base: turbogs            # configuration that the variants change
@@ -12,13 +12,11 @@ A YAML in ``configs/ablations/``::
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from turbogs_plugin.config.auto import AUTO
 from turbogs_plugin.config.configuration import Config, load_config, named_beside
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.config.schema import build_dataclass, nearest
@@ -33,12 +31,12 @@ _NAME = re.compile(r"[A-Za-z0-9+][A-Za-z0-9_+.-]{0,47}")
 
 @dataclass
 class Ablation:
-    """Named variants.
+    """Named variants of a configuration.
 
     Args:
-        title: of the table.
+        title: heading of the report.
         variants: name -> overrides ``section.key=value`` of the base configuration. Names become file names.
-        base: a packaged configuration or a YAML file; of `load_ablation`, one by its place beside the ablation's.
+        base: a packaged configuration or a YAML file; `load_ablation` looks for the file beside the ablation's.
         baseline: the variant that the others are compared with; the first one where empty.
         notes: name -> what a reader should know of a variant.
     """
@@ -65,7 +63,7 @@ class Ablation:
             raise InputError(f"no variant '{name}': {nearest(name, self.variants)}")
 
     def only(self, names: Sequence[str]) -> list[str]:
-        """These variants and the baseline, in the ablation's order; all variants where none is named."""
+        """Names of these variants and the baseline, in the ablation's order; of all variants where none is given."""
         for name in names:
             self.require_variant(name)
         return [name for name in self.variants if not names or name in (*names, self.baseline)]
@@ -73,7 +71,7 @@ class Ablation:
 
 @dataclass(frozen=True)
 class CellKey:
-    """One training of a grid. `scene`: the capture's name."""
+    """Name of a cell. `scene` is the capture's name."""
 
     scene: str
     variant: str
@@ -81,7 +79,7 @@ class CellKey:
 
     @property
     def file(self) -> Path:
-        """Where its result is, relative to the cells' folder."""
+        """Path of the cell's result, relative to the folder of cells."""
         return Path(self.scene) / f"{self.variant}--seed{self.seed}.json"
 
     def __str__(self) -> str:
@@ -89,7 +87,7 @@ class CellKey:
 
 
 def load_ablation(name_or_file: str) -> Ablation:
-    """The ablation of a packaged name or a YAML file.
+    """Ablation from a packaged name or a YAML file.
 
     Raises:
         InputError: an unknown name, an unreadable file, or one that is not an ablation.
@@ -99,40 +97,15 @@ def load_ablation(name_or_file: str) -> Ablation:
     return replace(ablation, base=named_beside(ablation.base, name_or_file))
 
 
-def alike_at(ablation: Ablation, variants: Sequence[str], overrides: Sequence[str], steps: int) -> dict[str, str]:
-    """Variants that become the same as another one when all have this length -> that other variant.
-
-    A variant may differ from another one by nothing but `train.epochs`, which a given number of iterations replaces.
-    Variants that are the same at their own lengths, too, are not listed: the ablation wants them so.
-
-    Raises:
-        InputError: naming the variant, whatever is wrong with its configuration.
-    """
-
-    def text(variant: str, length: int | None) -> str:
-        mapping = variant_config(ablation, variant, 0, overrides, length).to_mapping()
-        if mapping["train"]["iterations"] != AUTO:
-            del mapping["train"]["epochs"], mapping["train"]["base_iterations"]
-        return json.dumps(mapping, sort_keys=True)
-
-    alike: dict[str, str] = {}
-    first: dict[str, str] = {}
-    for variant in sorted(variants, key=lambda name: name != ablation.baseline):
-        known = first.setdefault(text(variant, steps), variant)
-        if known != variant and text(known, None) != text(variant, None):
-            alike[variant] = known
-    return alike
-
-
 def variant_config(ablation: Ablation, variant: str, seed: int, overrides: Sequence[str], steps: int | None) -> Config:
-    """The configuration of a variant.
+    """Configuration of a variant.
 
     Args:
-        overrides: of all variants, on top of the variant's own.
-        steps: iterations; None: the configuration's own number.
+        overrides: ``section.key=value`` for all variants, on top of the variant's own.
+        steps: iterations, to which everything that counts iterations is scaled; None: the configuration's own number.
 
     Raises:
-        InputError: naming the variant, whatever is wrong with its configuration.
+        InputError: the configuration is wrong; the message names the variant.
     """
     try:
         config = load_config(ablation.base, [*ablation.variants[variant], *overrides, f"train.seed={seed}"])
@@ -140,8 +113,8 @@ def variant_config(ablation: Ablation, variant: str, seed: int, overrides: Seque
         raise InputError(f"variant '{variant}': {error}") from None
     if config.budget.max_memory:
         raise InputError(
-            f"variant '{variant}': budget.max_memory holds a whole process, which here trains all cells: "
-            "leave it out, or limit density.max_gaussians"
+            f"variant '{variant}': budget.max_memory limits a whole process, which here trains all cells: leave it "
+            "out, or limit density.max_gaussians"
         )
     if steps is None:
         return config

@@ -1,39 +1,60 @@
-"""What the trainings of a study gave."""
+"""What the cells of a study gave, and the files that keep it.
+
+A folder of a study has ``results.json``, from which its page is made, and while cells are trained a file for each,
+``cells/SCENE/VARIANT--seedN.json``, written when the cell ends: whatever stops the process, no finished cell is lost.
+Both are plain JSON of one form. Settings are flat there, ``section.key`` -> value: ``settings`` has the first cell's,
+and each cell what is different in its own, null for a setting that it has not.
+"""
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.study.grid import Ablation, CellKey
 from turbogs_plugin.train.history import Evaluation
 
+FORMAT = 3
+"""Version of ``results.json``: raised whenever an older version of TurboGS would misread a new file."""
+
+CURVE = {"iteration": "iteration", "seconds": "train_seconds", "gaussians": "num_gaussians"}
+CURVE |= {name: name for name in ("psnr", "ssim", "l1")}
+"""Column of a cell's curve -> field of `Evaluation`."""
+
+LAST = ("worst_psnr", "refined_psnr", "refined_ssim", "nonfinite_losses", "skipped_updates")
+"""Fields of the last `Evaluation` that a cell's `final` has besides the curve's columns."""
+
+DIGITS = {"seconds": 3, "psnr": 3, "ssim": 5, "l1": 6, "lpips": 5, "flip": 5, "fps": 1}
+"""Digits behind the point that the files keep of a measure, by the last word of its name."""
+
 
 @dataclass(kw_only=True)
 class CellResult:
-    """What one training gave. `turbogs_plugin.study.results_file` keeps all of it, in this order.
+    """Result of one training.
 
     Args:
-        scene, variant, seed: which.
-        capture: `capture_digest` of the scene, or "" where it was not recorded.
-        provenance: machine, versions and commit, or None where they were not recorded.
-        resolved: False in a record that has only the configuration asked for, which is then `config`.
-        warmup_iterations: iterations of the same configuration, but for the seed, that the process had trained before
-            the clock started, on a model thrown away.
+        scene, variant, seed: which cell.
+        capture: `capture_digest` of the capture; "" where it was not recorded.
+        provenance: machine, versions and commit; None where they were not recorded.
+        settings: the configuration that was asked for, flat.
+        planned: settings that plan and budgets made of it, where they differ.
+        curve: column -> [E] its values at the evaluations, in the order of training. Columns: those of `CURVE`.
+        final: measure -> value of the final model: the curve's last values; ``worst_psnr`` of the worst test view;
+            ``refined_psnr`` and ``refined_ssim`` by refined test cameras; ``lpips``, ``flip``; ``fps``, test views
+            rendered a second; ``peak_mib``, peak of the GPU's tensors while training; ``wall_seconds`` of a run, from
+            its process's start until its model was written; ``cell_seconds`` of a cell: loading its capture, plan,
+            training and evaluations. Measures that were not taken are absent.
         lpips_reason: why LPIPS was not computed; empty where it was.
-        config: its configuration, as plan and budgets resolved it.
-        asked: the configuration that was asked for: by it a finished cell is recognised.
-        overrides, steps: what the call of the study asked for beside its variant (`variant_config`); empty and None
-            where it asked for nothing, or where that was not recorded.
-        lpips, flip: of the final model; NaN where they were not computed.
-        fps: test views rendered a second, one after the other; NaN where it was not recorded.
-        wall_seconds: of a run, from its process's start until its model was written; NaN where a process has many.
-        cell_seconds: of a study's cell, on the wall: loading its capture (once for all its cells, and counted in each),
-            plan, training and evaluations; NaN for runs, and where it was not recorded.
-        peak_bytes: peak of the GPU's tensors while training, or None where it was not measured.
-        history: every evaluation, the last one of the final model.
     """
 
     scene: str
@@ -41,34 +62,20 @@ class CellResult:
     seed: int
     capture: str = ""
     provenance: Provenance | None = None
-    resolved: bool = True
-    warmup_iterations: int = 0
+    settings: dict[str, Any]
+    planned: dict[str, Any] = field(default_factory=dict)
+    curve: dict[str, list[float]]
+    final: dict[str, float]
     lpips_reason: str = ""
-    config: dict[str, Any]
-    asked: dict[str, Any]
-    overrides: list[str] = field(default_factory=list)
-    steps: int | None = None
-    lpips: float = math.nan
-    flip: float = math.nan
-    fps: float = math.nan
-    wall_seconds: float = math.nan
-    cell_seconds: float = math.nan
-    peak_bytes: int | None = None
-    history: list[Evaluation]
 
     @property
     def key(self) -> CellKey:
         return CellKey(self.scene, self.variant, self.seed)
 
-    @property
-    def final(self) -> Evaluation:
-        """The evaluation of the final model."""
-        return self.history[-1]
-
-    @property
-    def time_budget(self) -> str:
-        """As it was written, for instance 20s; empty where there is none."""
-        return self.config["budget"]["time"]
+    def text(self) -> str:
+        """``31.20 dB in 4.7 s, 150000 Gaussians``."""
+        psnr, seconds = self.final.get("psnr", math.nan), self.final["seconds"]
+        return f"{psnr:.2f} dB in {seconds:.1f} s, {self.final['gaussians']} Gaussians"
 
 
 @dataclass
@@ -81,19 +88,17 @@ class Failure:
 
 @dataclass
 class Study:
-    """An ablation with the results that are there, of all its variants or some.
+    """An ablation with the results of its cells.
 
     Args:
-        ablation: titles, variants, baseline.
-        results: of finished cells, in the order of the grid.
-        failures: of broken ones.
-        targets: PSNRs in dB whose time is asked for; none: they follow from the baseline's result.
+        ablation: title, variants, baseline.
+        results: finished cells: captures in the order of their names, variants in the ablation's, seeds ascending.
+        failures: broken cells.
     """
 
     ablation: Ablation
     results: list[CellResult]
     failures: list[Failure] = field(default_factory=list)
-    targets: list[float] = field(default_factory=list)
 
     @property
     def scenes(self) -> list[str]:
@@ -101,10 +106,184 @@ class Study:
 
     @property
     def provenances(self) -> list[Provenance | None]:
-        """The different ones of the results, in their order."""
+        """Different provenances of the results, in the results' order."""
         made = [result.provenance for result in self.results]
         return [entry for number, entry in enumerate(made) if entry not in made[:number]]
 
     def of(self, scene: str, variant: str) -> list[CellResult]:
-        """The results of all seeds."""
+        """Results of all seeds of a variant on a capture."""
         return [result for result in self.results if (result.scene, result.variant) == (scene, variant)]
+
+
+def curve_and_final(history: Sequence[Evaluation]) -> tuple[dict[str, list[float]], dict[str, float]]:
+    """`CellResult.curve` and the part of `CellResult.final` that a history has, which has one evaluation or more."""
+    curve = {name: [getattr(entry, source) for entry in history] for name, source in CURVE.items()}
+    values = {name: column[-1] for name, column in curve.items()} | {name: getattr(history[-1], name) for name in LAST}
+    return curve, measured(values)
+
+
+def measured(values: Mapping[str, float | None]) -> dict[str, float]:
+    """Those values that are there and finite."""
+    return {name: value for name, value in values.items() if value is not None and math.isfinite(value)}
+
+
+def flat_settings(mapping: Mapping[str, Any], place: str = "") -> dict[str, Any]:
+    """``section.key`` -> value of a nested configuration (`Config.to_mapping`), without what is null.
+
+    The capture's path becomes its name: where a capture lies is no part of a result.
+    """
+    flat: dict[str, Any] = {}
+    for key, value in mapping.items():
+        path = f"{place}.{key}" if place else key
+        if isinstance(value, dict) and value:
+            flat |= flat_settings(value, path)
+        elif value is not None:
+            flat[path] = Path(value).name if path == "scene.path" else value
+    return flat
+
+
+def changes(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """What `own` has other than `common`, both flat; None for a setting that `own` has not."""
+    changed = {path: value for path, value in own.items() if path not in common or common[path] != value}
+    return changed | {path: None for path in common if path not in own}
+
+
+def with_changes(common: Mapping[str, Any], changed: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings whose `changes` from `common` these are."""
+    return {path: value for path, value in {**common, **changed}.items() if value is not None}
+
+
+class StudyFolder:
+    """Files of a study: ``results.json``, the page and the plots beside it, and the cells' own files."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.file = path / "results.json"
+        self.cells = path / "cells"
+
+    def require_usable(self) -> None:
+        """Raise `InputError` where the folder holds anything but a study, or cannot be one."""
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError(f"--out '{self.path}' is a file: choose a folder")
+        if self.path.is_dir() and any(self.path.iterdir()) and not self.file.is_file():
+            raise InputError(f"--out '{self.path}' is not empty and holds no study: choose a new folder")
+
+    def write(self, outcome: CellResult | Failure) -> None:
+        """Keep a cell's result, or the reason why there is none, as a study of that cell alone."""
+        path = self.cells / outcome.key.file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        ablation = Ablation(title=str(outcome.key), variants={outcome.key.variant: []})
+        study = Study(ablation, [], [outcome]) if isinstance(outcome, Failure) else Study(ablation, [outcome])
+        write_text_atomically(path, _text(study))
+
+    def ended(self, key: CellKey) -> bool:
+        """Whether a cell has a file: a result or a failure."""
+        return (self.cells / key.file).is_file()
+
+    def forget_failures(self) -> None:
+        """Remove the files of broken cells, so that they are trained again."""
+        for path in self.cells.glob("*/*.json"):
+            if _parsed(path).failures:
+                path.unlink(missing_ok=True)
+
+    @contextmanager
+    def claimed(self, key: CellKey) -> Iterator[bool]:
+        """Whether the cell is this process's to train while entered: no other process holds it.
+
+        The system frees the lock of a process that is killed.
+        """
+        path = (self.cells / key.file).with_suffix(".lock")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(path)
+        try:
+            lock.acquire(blocking=False)
+        except Timeout:
+            yield False
+            return
+        try:
+            yield True
+        finally:
+            lock.release()
+
+    def write_study(self, study: Study) -> None:
+        """Write ``results.json``."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        write_text_atomically(self.file, _text(study))
+
+    def read_study(self) -> Study:
+        """Everything that the folder has, of ``results.json`` and of the cells' own files.
+
+        Raises:
+            InputError: no study, or a file that is wrong, which is named.
+        """
+        if not self.file.is_file():
+            raise InputError(f"'{self.path}' holds no study: there is no {self.file.name}")
+        study = _parsed(self.file)
+        parts = [study, *(_parsed(path) for path in self.cells.glob("*/*.json"))]
+        found = {result.key: result for part in parts for result in part.results}
+        broken = {failure.key: failure for part in parts for failure in part.failures}
+        order = {name: number for number, name in enumerate(study.ablation.variants)}
+        for key in found:
+            if key.variant not in order:
+                raise InputError(f"'{self.path}' has a cell of another ablation ({key}): choose a new --out")
+        results = sorted(found.values(), key=lambda result: (result.scene, order[result.variant], result.seed))
+        return Study(study.ablation, results, [failure for key, failure in broken.items() if key not in found])
+
+
+def _text(study: Study) -> str:
+    """JSON of a study, a line for each cell."""
+    provenances = study.provenances
+    common = study.results[0].settings if study.results else {}
+    document: dict[str, Any] = {"format": FORMAT, **asdict(study.ablation)}
+    document["provenances"] = [entry and asdict(entry) for entry in provenances]
+    document["settings"] = common
+    document["failures"] = [{**asdict(failure.key), "reason": failure.reason} for failure in study.failures]
+    lines = [f"{json.dumps(name)}: {json.dumps(value, ensure_ascii=False)}" for name, value in document.items()]
+    cells = []
+    for result in study.results:
+        entry = vars(result) | {
+            "provenance": provenances.index(result.provenance),
+            "settings": changes(common, result.settings),
+            "curve": {name: [_rounded(name, value) for value in column] for name, column in result.curve.items()},
+            "final": {name: _rounded(name, value) for name, value in result.final.items()},
+        }
+        cells.append(json.dumps(entry, ensure_ascii=False))
+    lines.append('"cells": [\n' + ",\n".join(cells) + "\n]")
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def _rounded(name: str, value: float) -> float | None:
+    """A measure with the digits that are kept; None, which JSON calls null, where it is not finite."""
+    if not math.isfinite(value):
+        return None
+    return round(value, DIGITS.get(name.rpartition("_")[2], 1)) if isinstance(value, float) else value
+
+
+def _parsed(path: Path) -> Study:
+    """Study of a file that `_text` made."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read '{path}': {error}") from None
+    try:
+        if document["format"] != FORMAT:
+            said = f"'{path}' is of format {document['format']}: this version of TurboGS reads format {FORMAT}"
+            raise InputError(said)
+        ablation = Ablation(**{entry.name: document[entry.name] for entry in fields(Ablation)})
+        provenances = [entry and Provenance(**entry) for entry in document["provenances"]]
+        failures = [
+            Failure(CellKey(entry["scene"], entry["variant"], entry["seed"]), entry["reason"])
+            for entry in document["failures"]
+        ]
+        results = [_result(entry, document["settings"], provenances) for entry in document["cells"]]
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        raise InputError(f"'{path}' does not hold results of a study ({error!r}): choose a new --out") from None
+    return Study(ablation, results, failures)
+
+
+def _result(entry: dict[str, Any], common: dict[str, Any], provenances: Sequence[Provenance | None]) -> CellResult:
+    result = CellResult(**entry | {"provenance": provenances[entry["provenance"]]})
+    curve = {name: [math.nan if value is None else value for value in result.curve[name]] for name in CURVE}
+    if not curve["seconds"] or {len(column) for column in curve.values()} != {len(curve["seconds"])}:
+        raise TypeError(f"curve of {result.key}: columns of one length are needed")
+    return replace(result, settings=with_changes(common, result.settings), curve=curve)

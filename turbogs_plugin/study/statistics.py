@@ -1,15 +1,23 @@
-"""Numbers over seeds: means and spreads, differences, time to reach an error, and the Pareto front."""
+"""Numbers over seeds: means with standard errors, differences, time to reach an error, and the Pareto front."""
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import ttest_ind
 
-from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.study.results import CellResult, Study
+
+FEWEST_SEEDS = 3
+"""Seeds of a variant and of the baseline from which a difference may be called clear."""
+NOISE = 0.05
+"""A difference is clear where noise alone would make as large a one in a smaller share of cases."""
+TARGET_STEP = 0.5
+"""dB between the default targets of the time to a PSNR. The highest one is what every seed of the baseline reached,
+rounded down."""
 
 
 @dataclass(frozen=True)
@@ -17,36 +25,9 @@ class Spread:
     """A quantity over seeds.
 
     Args:
-        mean, low, high: of the seeds' values; NaN where there is none.
-        count: seeds.
-    """
-
-    mean: float
-    low: float
-    high: float
-    count: int
-
-    @classmethod
-    def of(cls, values: Iterable[float | None]) -> Spread:
-        """NaN or None in any makes all NaN: a mean over some seeds would be compared with means over all."""
-        values = list(values)
-        if not values or any(value is None or math.isnan(value) for value in values):
-            return cls(math.nan, math.nan, math.nan, len(values))
-        return cls(math.fsum(values) / len(values), min(values), max(values), len(values))
-
-
-T95 = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23)
-"""Student's t of 1 .. 10 degrees of freedom: standard errors within which 95 % of means of pure noise lie."""
-
-
-@dataclass(frozen=True)
-class Difference:
-    """A quantity minus the baseline's, seed by seed: both ran with the same seed, so that what it decides cancels.
-
-    Args:
-        mean: over the seeds that both have; NaN where there is none.
+        mean: over the seeds; NaN where there is none.
         standard_error: of the mean; NaN for fewer than two seeds.
-        count: seeds.
+        count: number of seeds.
     """
 
     mean: float
@@ -54,80 +35,75 @@ class Difference:
     count: int
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Difference:
-        """Of the differences of each seed."""
-        count = len(values)
-        mean = math.fsum(values) / count if count else math.nan
-        squares = math.fsum((value - mean) ** 2 for value in values)
-        return cls(mean, math.sqrt(squares / (count - 1) / count) if count > 1 else math.nan, count)
-
-    @property
-    def clear(self) -> bool | None:
-        """Whether noise alone would make so much in less than one case of twenty; None for one seed."""
-        if math.isnan(self.standard_error):
-            return None
-        return abs(self.mean) > T95[min(self.count - 1, len(T95)) - 1] * self.standard_error
-
-
-def seconds_to_reach(history: Sequence[Evaluation], level: float, measure: str = "psnr") -> float:
-    """Seconds of training after which a run first reached this test PSNR, linear between evaluations; inf if never.
-
-    Args:
-        measure: another one that rises: ``ssim``.
-    """
-    for before, after in zip([None, *history], history, strict=False):
-        reached = getattr(after, measure)
-        if reached >= level:
-            if before is None:
-                return after.train_seconds
-            earlier = getattr(before, measure)
-            share = (level - earlier) / (reached - earlier)
-            return before.train_seconds + share * (after.train_seconds - before.train_seconds)
-    return math.inf
-
-
-def crossing_gap(history: Sequence[Evaluation], psnr: float) -> float:
-    """Seconds of training between the evaluations on either side of the moment of `seconds_to_reach`; NaN where a run
-    never reached it, or began there."""
-    for before, after in itertools.pairwise(history):
-        if before.psnr >= psnr:
-            break
-        if after.psnr >= psnr:
-            return after.train_seconds - before.train_seconds
-    return math.nan
+    def of(cls, values: Iterable[float]) -> Spread:
+        """Spread of the seeds' values; NaN or inf in any makes all NaN: means over different seeds do not compare."""
+        array = np.array(list(values), dtype=np.float64)  # [S]
+        if not len(array) or not np.isfinite(array).all():
+            return cls(math.nan, math.nan, len(array))
+        error = float(array.std(ddof=1)) / math.sqrt(len(array)) if len(array) > 1 else math.nan
+        return cls(float(array.mean()), error, len(array))
 
 
 @dataclass(frozen=True)
-class Curve:
-    """One measure against seconds over seeds, at the iterations that every seed evaluated.
+class Difference:
+    """A quantity's mean over a variant's seeds minus its mean over the baseline's.
+
+    Seeds are not paired: one seed gives different trainings to two variants, and their results do not correlate.
 
     Args:
-        seconds: [E] mean over seeds.
-        mean, low, high: [E] of the measure.
+        mean: the difference; NaN where either has no value.
+        standard_error: of the difference; NaN where either has fewer than two seeds.
+        clear: whether noise alone would make as large a difference in fewer than one case of twenty (Welch's t-test);
+            None where either has fewer than `FEWEST_SEEDS` seeds.
     """
 
-    seconds: np.ndarray
-    mean: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    mean: float
+    standard_error: float
+    clear: bool | None
 
     @classmethod
-    def of(cls, histories: Sequence[Sequence[Evaluation]], name: str) -> Curve:
-        """The curve of a field of `Evaluation`. If a time budget ended seeds at different iterations, evaluations are
-        paired in order when all seeds have as many, as they are at the same fractions of it; else their ends are."""
-        common = set.intersection(*({entry.iteration for entry in history} for history in histories))
-        rows = [[entry for entry in history if entry.iteration in common] for history in histories]
-        if any(history[-1].iteration not in common for history in histories):
-            rows = [[*row, history[-1]] for row, history in zip(rows, histories, strict=True)]
-            if len({len(history) for history in histories}) == 1:
-                rows = histories
-        values = np.array([[getattr(entry, name) for entry in row] for row in rows])  # [seeds, E]
-        seconds = np.array([[entry.train_seconds for entry in row] for row in rows])
-        return cls(seconds.mean(axis=0), values.mean(axis=0), values.min(axis=0), values.max(axis=0))
+    def of(cls, own: Sequence[float], base: Sequence[float]) -> Difference:
+        first, second = Spread.of(own), Spread.of(base)
+        mean, error = first.mean - second.mean, math.hypot(first.standard_error, second.standard_error)
+        if min(first.count, second.count) < FEWEST_SEEDS or math.isnan(mean):
+            return cls(mean, error, None)
+        if error == 0.0:  # of which the test knows nothing
+            return cls(mean, error, mean != 0.0)
+        return cls(mean, error, bool(ttest_ind(own, base, equal_var=False).pvalue < NOISE))
+
+
+def seconds_to_reach(curve: Mapping[str, Sequence[float]], level: float, measure: str = "psnr") -> float:
+    """Seconds of training after which a cell first reached a level, linear between evaluations; inf if never.
+
+    Args:
+        curve: `CellResult.curve`.
+        measure: a column that rises: ``psnr`` in dB, or ``ssim``.
+    """
+    seconds, values = curve["seconds"], curve[measure]
+    for place, reached in enumerate(values):
+        if reached >= level:
+            if place == 0:
+                return seconds[0]
+            share = (level - values[place - 1]) / (reached - values[place - 1])
+            return seconds[place - 1] + share * (seconds[place] - seconds[place - 1])
+    return math.inf
+
+
+def mean_curve(curves: Sequence[Mapping[str, Sequence[float]]], measure: str) -> tuple[np.ndarray, np.ndarray]:
+    """Seconds and a measure over seeds: [2, E], their means, and [2, E], their standard errors (0 for one seed).
+
+    Evaluations are paired in their order, as they are at the same shares of a training. Where budgets have given seeds
+    different numbers of evaluations, the first ones and the last one are.
+    """
+    count = min(len(curve["seconds"]) for curve in curves)
+    chosen = [*range(count - 1), -1]
+    values = np.array([[np.array(curve[name])[chosen] for name in ("seconds", measure)] for curve in curves])
+    errors = values.std(axis=0, ddof=1) / math.sqrt(len(curves)) if len(curves) > 1 else np.zeros_like(values[0])
+    return values.mean(axis=0), errors
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """For each (seconds, quality) whether no other is at least as fast and as good, and better in one of the two.
+    """For each (cost, quality) whether no other point costs as little and is as good, and is better in one of the two.
 
     A point with NaN is not on the front and keeps no other point from it, as no comparison with NaN is true.
     """
@@ -136,3 +112,83 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
         return any(other[0] <= point[0] and other[1] >= point[1] and other != point for other in points)
 
     return [not math.isnan(sum(point)) and not beaten(point) for point in points]
+
+
+@dataclass(eq=False)
+class VariantRow:
+    """One variant on one capture, measured over its seeds and compared with the baseline.
+
+    Args:
+        name: of the variant.
+        cells: results of its seeds.
+        base: results of the baseline; none where it has none here.
+        on_front: whether no other variant is at least as fast and has at least the PSNR.
+    """
+
+    name: str
+    cells: Sequence[CellResult]
+    base: Sequence[CellResult]
+    on_front: bool = False
+
+    def values(self, measure: str) -> list[float]:
+        """A measure of `CellResult.final`, for each seed; NaN where a seed lacks it."""
+        return _values(self.cells, measure)
+
+    def spread(self, measure: str) -> Spread:
+        return Spread.of(self.values(measure))
+
+    def difference(self, measure: str) -> Difference:
+        """Difference from the baseline."""
+        return Difference.of(self.values(measure), _values(self.base, measure))
+
+    def ratio(self, measure: str) -> float:
+        """Mean over the baseline's mean; NaN where there is none."""
+        return self.spread(measure).mean / Spread.of(_values(self.base, measure)).mean
+
+    def seconds_to(self, psnr: float) -> list[float]:
+        """Seconds in which each seed reached a PSNR in dB; inf where it never did."""
+        return [seconds_to_reach(cell.curve, psnr) for cell in self.cells]
+
+    def ratio_to(self, psnr: float) -> float:
+        """Mean `seconds_to` over the baseline's; NaN where a seed of either never reached it, or began there."""
+        base = Spread.of(seconds_to_reach(cell.curve, psnr) for cell in self.base).mean
+        own = Spread.of(self.seconds_to(psnr)).mean
+        return own / base if base > 0 and own > 0 else math.nan
+
+
+def _values(cells: Sequence[CellResult], measure: str) -> list[float]:
+    return [cell.final.get(measure, math.nan) for cell in cells]
+
+
+@dataclass
+class SceneSummary:
+    """All variants on one capture, in the order of the ablation.
+
+    Args:
+        scene: the capture's name.
+        baseline: name of the variant that the others are compared with, or "" where it has no result here.
+        targets: PSNRs in dB whose time is asked for.
+    """
+
+    scene: str
+    baseline: str
+    targets: list[float]
+    rows: list[VariantRow]
+
+
+def summarise(study: Study, targets: Sequence[float] = ()) -> list[SceneSummary]:
+    """Rows of each capture. `targets`: PSNRs in dB; where empty they follow from the baseline's result."""
+    return [_summarise_scene(study, scene, targets) for scene in study.scenes]
+
+
+def _summarise_scene(study: Study, scene: str, targets: Sequence[float]) -> SceneSummary:
+    cells = {name: results for name in study.ablation.variants if (results := study.of(scene, name))}
+    baseline = study.ablation.baseline if study.ablation.baseline in cells else ""
+    rows = [VariantRow(name, results, cells.get(baseline, [])) for name, results in cells.items()]
+    points = [(row.spread("seconds").mean, row.spread("psnr").mean) for row in rows]
+    for row, on_front in zip(rows, pareto_front(points), strict=True):
+        row.on_front = on_front
+    reached = min(next((row for row in rows if row.name == baseline), rows[0]).values("psnr"))
+    if not targets and math.isfinite(reached):
+        targets = [math.floor(10 * reached) / 10 - step * TARGET_STEP for step in (2, 1, 0)]
+    return SceneSummary(scene, baseline, list(targets), rows)

@@ -220,7 +220,7 @@ def _posed_capture(config: Config, out: Path) -> str:
     """The path of the capture; where that is of photos alone, of their reconstruction, which is made."""
     if not holds_photos_alone(Path(config.scene.path)):
         return config.scene.path
-    from turbogs_plugin.reconstruct.train_on_photos import reconstruct_beside  # no other run needs that room
+    from turbogs_plugin.reconstruct.run import reconstruct_beside  # no other run needs that room
 
     return str(reconstruct_beside(config, out))
 

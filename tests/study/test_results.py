@@ -1,0 +1,158 @@
+"""`results.json` and the cells' own files: what is written is read again, plain and small."""
+
+import json
+import math
+import re
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.report.provenance import Provenance
+from turbogs_plugin.study.grid import Ablation, CellKey
+from turbogs_plugin.study.results import (
+    CellResult,
+    Failure,
+    Study,
+    StudyFolder,
+    changes,
+    curve_and_final,
+    flat_settings,
+    with_changes,
+)
+from turbogs_plugin.train.history import Evaluation
+
+HERE = Provenance("a machine", {"torch": "2"}, "none", "abc")
+ABLATION = Ablation("Two", {"base": [], "other": ["loss.type=charbonnier"]}, notes={"other": "no | NCC"})
+
+
+def result(variant: str, seed: int, scene: str = "fox", **changed) -> CellResult:
+    config = load_config("turbogs", [*ABLATION.variants[variant], f"train.seed={seed}"])
+    config.scene.path = f"/somewhere/{scene}"
+    history = [
+        Evaluation(0, 0.125, 9.5, math.nan, 0.25, 50, 2**20),
+        Evaluation(26, 2.5, 30.125 + seed, 0.9, 0.02, 90, 2**21, refined_psnr=30.5),
+    ]
+    curve, final = curve_and_final(history)
+    known = {"provenance": HERE, "capture": "c0ffee", "settings": flat_settings(config.to_mapping())}
+    known |= {"planned": {"train.iterations": 26}, "curve": curve, "final": {**final, "fps": 100.5}}
+    return CellResult(scene=scene, variant=variant, seed=seed, **(known | changed))
+
+
+def study() -> Study:
+    results = [result(variant, seed) for variant in ABLATION.variants for seed in (0, 1)]
+    results[3] = replace(results[3], provenance=replace(HERE, machine="another"), capture="")
+    results.append(result("base", 0, "h", provenance=None, lpips_reason="no weights"))
+    return Study(ABLATION, results, [Failure(CellKey("h", "other", 1), "it broke")])
+
+
+@pytest.fixture
+def folder(tmp_path) -> StudyFolder:
+    folder = StudyFolder(tmp_path / "study")
+    folder.write_study(study())
+    return folder
+
+
+def test_a_study_is_read_as_it_was_written(folder):
+    again = folder.read_study()
+    assert repr(again) == repr(study())
+    text = folder.file.read_text()
+    folder.write_study(again)
+    assert folder.file.read_text() == text
+
+
+def test_the_file_is_plain_and_says_once_what_cells_share(folder):
+    text = folder.file.read_text()
+    document = json.loads(text)
+    first, second, third = document["cells"][:3]
+    assert text.count("a machine") == text.count("pixel_sampler.type") == 1
+    assert document["settings"]["scene.path"] == "fox", "where a capture lies is no part of a result"
+    assert (first["settings"], second["settings"]) == ({}, {"train.seed": 1})
+    assert third["settings"]["loss.type"] == "charbonnier" and third["settings"]["loss.ncc_weight"] is None
+    assert second["final"] == first["final"] | {"psnr": 31.125} and first["final"]["refined_psnr"] == 30.5
+    assert first["curve"]["psnr"] == [9.5, 30.125] and first["curve"]["ssim"] == [None, 0.9]
+    assert len(text) < 10_000
+
+
+def test_numbers_have_the_digits_that_a_reader_can_use(folder):
+    curve, final = curve_and_final([Evaluation(26, 2.12345678, 30.12345678, 0.812345678, 0.0123456789, 90)])
+    folder.write_study(Study(ABLATION, [result("base", 0, curve=curve, final=final | {"worst_psnr": 25.98765})]))
+    (read,) = folder.read_study().results
+    assert read.final == {
+        "iteration": 26, "seconds": 2.123, "gaussians": 90, "psnr": 30.123, "ssim": 0.81235, "l1": 0.012346,
+        "worst_psnr": 25.988, "nonfinite_losses": 0, "skipped_updates": 0,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"format": 2}, "results.json' is of format 2: this version of TurboGS reads format 3"),
+        ({"cells": 3}, "results.json' does not hold results of a study"),
+        ({"variants": {}}, "variants: at least one is needed"),
+        ({"cells": [{"scene": "fox"}]}, "results.json' does not hold results of a study"),
+    ],
+)
+def test_a_file_that_is_wrong_is_refused_by_name(folder, changed, words):
+    folder.file.write_text(json.dumps(json.loads(folder.file.read_text()) | changed))
+    with pytest.raises(InputError, match=re.escape(words)):
+        folder.read_study()
+
+
+@pytest.mark.parametrize("column", [[1.0], None])
+def test_a_curve_that_is_wrong_is_refused(folder, column):
+    document = json.loads(folder.file.read_text())
+    document["cells"][1]["curve"]["psnr"] = column
+    folder.file.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"results.json' does not hold results"):
+        folder.read_study()
+
+
+VALUES = st.sampled_from([0, 1.5, True, "", "x", [], [1, 2.0]])
+FLAT = st.dictionaries(st.sampled_from(["loss.type", "loss.rate", "density.until", "plan.x"]), VALUES)
+
+
+@given(FLAT, FLAT)
+def test_settings_are_restored_from_their_changes(common, own):
+    changed = json.loads(json.dumps(changes(common, own)))
+    assert with_changes(common, changed) == own and changes(own, own) == {}
+
+
+# Cells' own files
+
+
+def test_a_cell_that_is_not_in_the_results_yet_is_not_lost(folder):
+    new = result("other", 1, "h")
+    folder.write(new)
+    read = folder.read_study()
+    assert read.results[-1] == new and not read.failures, "a failure is forgotten when its cell is there"
+    folder.write_study(read)
+    (folder.cells / new.key.file).unlink()
+    assert len(folder.read_study().results) == 6
+
+
+def test_failures_are_forgotten_where_they_are_tried_again(folder):
+    broken = Failure(CellKey("h", "base", 1), "no luck")
+    folder.write(broken)
+    folder.write(result("base", 2, "h"))
+    assert [failure.reason for failure in folder.read_study().failures] == ["it broke", "no luck"]
+    folder.forget_failures()
+    assert not folder.ended(broken.key) and folder.ended(CellKey("h", "base", 2))
+
+
+def test_a_cell_of_another_ablation_is_refused(folder):
+    folder.write(replace(result("base", 0), variant="unknown"))
+    with pytest.raises(InputError, match=r"cell of another ablation \(fox, unknown, seed 0\)"):
+        folder.read_study()
+
+
+def test_a_claimed_cell_is_one_s_alone_until_it_is_left(tmp_path):
+    first, second = StudyFolder(tmp_path), StudyFolder(tmp_path)
+    key, other = CellKey("fox", "a.b[1]", 3), CellKey("fox", "a.b[1]", 31)
+    with first.claimed(key) as mine, second.claimed(key) as taken, second.claimed(other) as free:
+        assert (mine, taken, free) == (True, False, True)
+    with second.claimed(key) as mine:
+        assert mine

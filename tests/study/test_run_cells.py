@@ -1,0 +1,348 @@
+"""`turbogs ablate`: cells are trained once, by one process or several, and calls go on where others stopped."""
+
+import json
+import multiprocessing
+import shutil
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from helpers.framework_runs import TINY, tiny_capture
+from helpers.processes import PRELOADED
+from helpers.simulated_time import SimulatedTime
+
+from turbogs_plugin import cli
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.plan.decisions import RULES, Verdict
+from turbogs_plugin.report.provenance import provenance
+from turbogs_plugin.scene import load_scene, write_demo_capture
+from turbogs_plugin.study import cell as cell_module
+from turbogs_plugin.study import run_cells
+from turbogs_plugin.study.cell import capture_digest, train_cell
+from turbogs_plugin.study.grid import CellKey, load_ablation, variant_config
+from turbogs_plugin.study.results import StudyFolder, flat_settings
+from turbogs_plugin.study.run_cells import CellChoice, run_study
+from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.run import train
+from turbogs_plugin.train.trainer import Trainer
+
+SMALL = """
+title: Tiny
+base: turbogs
+baseline: full
+variants:
+  full: []
+  random: [pixel_sampler.type=random]
+notes: {random: "a | bar"}
+"""
+
+pytestmark = pytest.mark.usefixtures("plotted", "cold")
+
+
+@pytest.fixture
+def warm() -> None:
+    """For tests of whole cells."""
+
+
+@pytest.fixture
+def cold(request, monkeypatch) -> None:
+    """Cells are trained without their warm-up, which takes as long and whose model is thrown away; not with `warm`."""
+    if "warm" not in request.fixturenames:
+        monkeypatch.setattr(cell_module, "warm_up", lambda *arguments: None)
+
+
+@pytest.fixture
+def small(tmp_path) -> Path:
+    path = tmp_path / "small.yaml"
+    path.write_text(SMALL)
+    return path
+
+
+SETTINGS = ("train.sh_degree=1", "schedule.min_views=1", "schedule.max_views=2", "train.evaluate_at=[0.5]")
+SETTINGS += ("schedule.pixel_budget=0.3",)
+
+
+def call(small: Path, capture: Path, out: Path, *more) -> list:
+    return ["ablate", small, *SETTINGS, "--scene", capture, "--out", out, "--device", "cpu", "--steps", "4", *more]
+
+
+@pytest.fixture(scope="module")
+def trained(capture, tmp_path_factory) -> Path:
+    """Folder of a study with the cell of `full` and seed 0. Not to be changed."""
+    folder = tmp_path_factory.mktemp("trained")
+    (folder / "small.yaml").write_text(SMALL)
+    choice = CellChoice([capture], only=["full"], overrides=SETTINGS, steps=4, device="cpu")
+    assert run_study(load_ablation(str(folder / "small.yaml")), choice, folder / "study") == []
+    return folder / "study"
+
+
+@pytest.fixture
+def study(trained, tmp_path) -> Path:
+    return Path(shutil.copytree(trained, tmp_path / "study"))
+
+
+def no_training(monkeypatch) -> None:
+    monkeypatch.setattr(Trainer, "step", lambda trainer: pytest.fail("a finished cell was trained again"))
+
+
+def test_a_study_is_complete_and_goes_on_where_it_stopped(turbogs, small, capture, tmp_path, monkeypatch, warm):
+    out, seeds = tmp_path / "study", ("--seeds", "0", "1", "2")
+    code, printed, err = turbogs(*call(small, capture, out, *seeds))
+    assert code == 0 and str(out / "report.md") in printed
+    assert "[6/6]" in err and "min" in err
+    cells = sorted(out.glob("cells/capture/*.json"))
+    assert [path.name for path in cells] == [f"{name}--seed{n}.json" for name in ("full", "random") for n in range(3)]
+    results = StudyFolder(out).read_study().results
+    first = results[0]
+    assert first.final["iteration"] == 4 and first.provenance.machine
+    assert all(result.final["cell_seconds"] > result.final["seconds"] for result in results), (
+        "and the capture's loading"
+    )
+    page = (out / "report.md").read_text()
+    mean = np.mean([result.final["psnr"] for result in results[3:]])
+    worst = np.mean([result.final["worst_psnr"] for result in results[3:]])
+    for word in (
+        f"| {mean:.2f} ± ",
+        f"| {worst:.2f} ± ",
+        "a \\| bar",
+        "torch",
+        "★",
+        "error-over-time.png",
+        "LPIPS was not",
+    ):
+        assert word in page, word
+    assert sorted(path.name for path in out.iterdir()) == [
+        "cells", "error-over-size.png", "error-over-time.png", "report.md", "results.json",
+    ]  # fmt: skip
+    no_training(monkeypatch)
+    stamps = [path.stat().st_mtime_ns for path in cells]
+    code, _, err = turbogs(*call(small, capture, out, *seeds))
+    assert code == 0 and "6 finished cells are kept" in err
+    assert [path.stat().st_mtime_ns for path in cells] == stamps
+    shutil.rmtree(out / "cells")
+    assert turbogs(*call(small, capture, out, *seeds))[0] == 0, "results.json alone is enough"
+    before = (out / "report.md").read_bytes()
+    assert turbogs("report", out)[0] == 0 and (out / "report.md").read_bytes() == before
+    assert turbogs("report", out, "--psnr", "7.5")[0] == 0 and "s to 7.5 dB" in (out / "report.md").read_text()
+
+
+def test_a_broken_cell_is_reported_and_tried_again(turbogs, small, capture, tmp_path, monkeypatch):
+    out, step = tmp_path / "study", Trainer.step
+
+    def broken(trainer):
+        if trainer.config.pixel_sampler["type"] == "error_guided":
+            raise RuntimeError("no such kernel")
+        step(trainer)
+
+    monkeypatch.setattr(Trainer, "step", broken)
+    code, printed, err = turbogs(*call(small, capture, out))
+    assert code == 1 and "no such kernel" in printed and "FAILED" in err
+    assert "no such kernel" in (out / "report.md").read_text()
+    monkeypatch.setattr(Trainer, "step", step)
+    code, _, err = turbogs(*call(small, capture, out))
+    assert code == 0 and "1 finished cells are kept" in err and "[1/1]" in err
+    assert "no such kernel" not in (out / "report.md").read_text()
+
+
+def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, study):
+    before = {path: path.read_bytes() for path in study.rglob("*") if path.is_file()}
+    changed = [*call(small, capture, study, "--only", "full")]
+    changed.insert(2, "loss.ncc_weight=0.1")
+    code, _, err = turbogs(*changed)
+    assert code == 2 and "other settings (loss.ncc_weight)" in err
+    assert {path: path.read_bytes() for path in study.rglob("*") if path.is_file()} == before
+
+
+def test_another_capture_of_the_same_name_is_not_taken_for_the_first(turbogs, small, capture, study, tmp_path):
+    (tmp_path / "moved").mkdir()
+    moved = shutil.copytree(capture, tmp_path / "moved" / capture.name)
+    code, _, err = turbogs(*call(small, moved, study, "--only", "full"))
+    assert code == 0 and "1 finished cells are kept" in err
+    other = write_demo_capture(tmp_path / capture.name, views=9, width=48, height=40)
+    code, _, err = turbogs(*call(small, other, study, "--only", "full", "--seeds", "1"))
+    assert code == 2 and "other photos or cameras" in err
+
+
+def test_a_process_warms_up_once_for_a_variant_and_capture(turbogs, small, capture, tmp_path, monkeypatch):
+    other, warmed = shutil.copytree(capture, tmp_path / "other"), []
+    monkeypatch.setattr(cell_module, "warm_up", lambda config, scene, *rest: warmed.append(scene.name))
+    code, _, err = turbogs(*call(small, capture, tmp_path / "study", "--scene", other, "--seeds", "0", "1"))
+    assert code == 0 and "[8/8]" in err
+    assert warmed == ["capture", "capture", "other", "other"]
+
+
+@pytest.mark.parametrize(
+    "length", [("train.iterations=30",), ("train.iterations=8", "train.epochs=2")], ids=["short", "long"]
+)
+def test_a_cell_with_a_time_budget_is_trained_as_a_run_with_one(small, capture, tmp_path, length, warm, monkeypatch):
+    """Fewer iterations than configured, or more pixels: the same numbers, and the same resolved configuration."""
+    SimulatedTime(monkeypatch, tick=1e-9).in_iterations(monkeypatch, lambda trainer: 0.125)
+    settings = (*TINY, *length, "budget.time=3s")
+    train(load_config("turbogs", [*settings, f"scene.path={capture}"]), tmp_path / "run")
+    choice = CellChoice([capture], only=["full"], overrides=settings, device="cpu")
+    assert run_study(load_ablation(str(small)), choice, tmp_path / "study") == []
+    (cell,) = StudyFolder(tmp_path / "study").read_study().results
+    assert 2.5 < cell.final["seconds"] < 3.5
+    history = read_history(tmp_path / "run" / "history.jsonl")
+    assert cell.curve["iteration"] == [entry.iteration for entry in history]
+    assert cell.curve["psnr"] == [round(entry.psnr, 3) for entry in history]
+    config = flat_settings(RunFolder(tmp_path / "run").read_config().to_mapping())
+    assert cell.settings | cell.planned == config
+    assert cell.planned["train.iterations"] != cell.settings["train.iterations"]
+
+
+def test_an_interrupted_study_reports_what_is_there(turbogs, small, capture, tmp_path, monkeypatch):
+    out, step = tmp_path / "study", Trainer.step
+
+    def interrupted(trainer):
+        if trainer.config.pixel_sampler["type"] == "random":
+            raise KeyboardInterrupt
+        step(trainer)
+
+    monkeypatch.setattr(Trainer, "step", interrupted)
+    code, printed, _ = turbogs(*call(small, capture, out))
+    assert code == 130 and "report" in printed
+    assert [result.variant for result in StudyFolder(out).read_study().results] == ["full"]
+    monkeypatch.setattr(Trainer, "step", step)
+    code, _, err = turbogs(*call(small, capture, out))
+    assert code == 0 and "1 finished cells are kept" in err and "[1/1]" in err
+
+
+def test_variants_of_one_study_may_be_trained_by_several_calls(turbogs, capture, tmp_path):
+    three, out = tmp_path / "three.yaml", tmp_path / "study"
+    three.write_text(SMALL.replace("notes:", "  l1: [loss.type=charbonnier]\nnotes:"))
+    for variant, there in (("random", ["full", "random"]), ("l1", ["full", "random", "l1"])):
+        assert turbogs(*call(three, capture, out, "--only", variant))[0] == 0
+        assert [result.variant for result in StudyFolder(out).read_study().results] == there
+        assert ("loss.type=charbonnier" in (out / "report.md").read_text()) is (variant == "l1")
+
+
+# Several processes
+
+
+def test_two_workers_train_each_cell_once(small, tmp_path, monkeypatch, capfd):
+    """Forked from a server that has torch, where the command starts Python; what they are told is pickled in both."""
+    capture, server = tiny_capture(tmp_path), multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(PRELOADED)
+    monkeypatch.setattr(multiprocessing, "get_context", {"spawn": server}.__getitem__)
+    arguments = call(small, capture, tmp_path / "study", "--seeds", "0", "1", "--gpus", "2")
+    monkeypatch.setattr(sys, "argv", ["turbogs", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    told = capfd.readouterr().err
+    assert not end.value.code, told
+    study = StudyFolder(tmp_path / "study").read_study()
+    assert len(study.results) == 4 and not study.failures
+    trained = [line.partition("] ")[2].partition(":")[0] for line in told.splitlines() if " dB in " in line]
+    assert len(trained) == 4 == len(set(trained))
+    assert (tmp_path / "study/report.md").is_file()
+
+
+def claim(folder: StudyFolder, key: CellKey, claimed, end) -> None:
+    with folder.claimed(key):
+        claimed.set()
+        end.wait()
+
+
+def test_a_cell_that_another_process_trains_is_waited_for_and_taken_over_when_that_dies(
+    small, capture, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(run_cells, "POLL_SECONDS", 0.0)
+    folder, context = StudyFolder(tmp_path / "study"), multiprocessing.get_context("fork")
+    folder.write_study(run_cells.Study(load_ablation(str(small)), []))
+    key, claimed, end = CellKey(capture.name, "full", 0), context.Event(), context.Event()
+    other = context.Process(target=claim, args=(folder, key, claimed, end))
+    other.start()
+    claimed.wait()
+    waited = []
+
+    def wait(seconds: float) -> None:
+        assert not folder.ended(key)
+        waited.append(seconds)
+        other.kill()
+        other.join()
+
+    clock = SimpleNamespace(sleep=wait, perf_counter=run_cells.time.perf_counter)
+    monkeypatch.setattr(run_cells, "time", clock)
+    choice = CellChoice([capture], only=["full"], overrides=SETTINGS, steps=4, device="cpu")
+    assert run_study(load_ablation(str(small)), choice, folder.path) == []
+    assert len(waited) == 1 and [result.key for result in folder.read_study().results] == [key]
+
+
+def test_a_cell_that_another_process_ended_meanwhile_is_kept(small, capture, tmp_path, monkeypatch):
+    """It ends after this process has seen what is there, and before it takes the cell."""
+    choice = CellChoice([capture], only=["full"], overrides=SETTINGS, steps=4, device="cpu")
+    ablation, folder, write_study = load_ablation(str(small)), StudyFolder(tmp_path / "study"), StudyFolder.write_study
+
+    def write(self: StudyFolder, study) -> None:
+        write_study(self, study)
+        monkeypatch.setattr(StudyFolder, "write_study", write_study)
+        run_study(ablation, choice, folder.path)
+        no_training(monkeypatch)
+
+    monkeypatch.setattr(StudyFolder, "write_study", write)
+    assert run_study(ablation, choice, folder.path) == []
+    assert len(folder.read_study().results) == 1
+
+
+# Cells
+
+
+def test_the_digest_of_a_capture_is_of_names_sizes_and_cameras(capture):
+    scene = load_scene(capture)
+    before = capture_digest(scene)
+    assert capture_digest(load_scene(capture)) == before != capture_digest(load_scene(capture, 2))
+    for part in (scene.train, scene.test):
+        unchanged = part.cameras.viewmats
+        part.cameras.viewmats = unchanged + 1e-3
+        assert capture_digest(scene) != before
+        part.cameras.viewmats = unchanged
+    scene.train.names = ("other", *scene.train.names[1:])
+    assert capture_digest(scene) != before
+
+
+def test_a_cell_has_the_planned_length_and_keeps_a_cap_on_gaussians(tmp_path, monkeypatch):
+    scene = load_scene(tiny_capture(tmp_path))
+    monkeypatch.setitem(RULES, "train.iterations", lambda facts, config: Verdict(6, "few"))
+    capped = ["train.iterations=auto", "train.base_iterations=14", "density.max_gaussians=90"]
+    result = train_cell("x", load_config("turbogs", [*TINY, *capped]), scene, torch.device("cpu"), provenance("cpu"))
+    assert result.final["iteration"] == 6 == result.planned["train.iterations"]
+    assert max(result.curve["gaussians"]) <= 90 and result.settings["train.iterations"] == "auto"
+    assert json.dumps(result.settings) and "lpips" not in result.final
+
+
+def test_a_limit_of_memory_which_is_of_a_process_is_refused():
+    with pytest.raises(run_cells.InputError, match=r"variant 'sparse-adam'.*max_memory.*max_gaussians"):
+        variant_config(load_ablation("parts"), "sparse-adam", 0, ("budget.max_memory=2GiB",), None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("ablate components --out X", ["needs --scene"]),
+        ("ablate component --scene CAPTURE --out X", ["did you mean 'components'"]),
+        ("ablate components --scene absent --out X", ["no such scene"]),
+        ("ablate components --scene CAPTURE --out X --only +geo", ["+geo-vs"]),
+        ("ablate components --scene CAPTURE --out X --seeds 1 1", ["seeds"]),
+        ("ablate components --scene CAPTURE --scene CAPTURE --out X", ["two folders are called"]),
+        ("ablate components --scene CAPTURE --out X --steps 0", ["--steps 0"]),
+        ("ablate components --scene CAPTURE --out X --gpus 0", ["--gpus 0"]),
+        ("ablate components budget.time=1s --scene CAPTURE --out X --steps 4", ["time budget 1s exclude each other"]),
+        ("ablate components --scene CAPTURE --out CAPTURE", ["not empty"]),
+        ("report CAPTURE CAPTURE --out X", ["holds no run"]),
+        ("report CAPTURE --out X", ["two runs or more"]),
+        ("report CAPTURE", ["holds no study"]),
+        ("report CAPTURE --psnr -1", ["--psnr"]),
+    ],
+)
+def test_bad_calls_are_refused(turbogs, capture, tmp_path, arguments, words):
+    places = {"CAPTURE": capture, "X": tmp_path / "x"}
+    code, out, err = turbogs(*(places.get(argument, argument) for argument in arguments.split()))
+    assert code == 2 and out == "" and err.count("\n") == 1, err
+    for word in words:
+        assert word in err
+    assert not (tmp_path / "x").exists()

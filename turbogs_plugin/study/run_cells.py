@@ -1,0 +1,250 @@
+"""Training of a study's cells: variants x captures x seeds, in one process or in one for each GPU.
+
+A cell that ends is kept in a file, and a process that trains one holds its lock (`StudyFolder`). So a call may be
+stopped at any moment and made again until all cells are there, and several calls may share a study's folder.
+"""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+import sys
+import time
+import traceback
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+
+from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.device import free_device_memory, processor_cores, synchronize
+from turbogs_plugin.distributed.processes import end_with_parent
+from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.report.provenance import Provenance, provenance
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.camera_refinement import load_and_find, with_cameras
+from turbogs_plugin.study.cell import capture_digest, train_cell
+from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
+from turbogs_plugin.study.results import CellResult, Failure, Study, StudyFolder, changes, flat_settings
+from turbogs_plugin.study.study_report import write_report
+from turbogs_plugin.train.start import resolve_device
+
+POLL_SECONDS = 1.0
+"""Time between two looks at cells that other processes train."""
+
+OF_A_CALL = ("train.device", "train.batch_for", "report.")
+"""Beginnings of settings that may differ between a kept cell and a later call: they change no result."""
+
+
+@dataclass(frozen=True)
+class CellChoice:
+    """What a call of a study trains.
+
+    Args:
+        scenes: folders of captures, of different names.
+        seeds: of each variant.
+        only: variants to train, and the baseline; all where empty.
+        overrides: ``section.key=value`` for all variants.
+        steps: iterations of every cell; None: the configurations' own.
+        device: auto, cpu or cuda.
+    """
+
+    scenes: Sequence[Path]
+    seeds: Sequence[int] = (0,)
+    only: Sequence[str] = ()
+    overrides: Sequence[str] = ()
+    steps: int | None = None
+    device: str = "auto"
+
+    def configs(self, ablation: Ablation) -> dict[CellKey, Config]:
+        """Configuration of each cell, capture after capture and seed after seed.
+
+        Raises:
+            InputError: a configuration is wrong, captures or seeds are alike, or a variant has other photos.
+        """
+        paths = [path.resolve() for path in self.scenes]
+        if not self.seeds or len(set(self.seeds)) != len(self.seeds):
+            raise InputError(f"seeds: one or more different ones are needed, got {list(self.seeds)}")
+        for first, second in itertools.combinations(paths, 2):
+            if first.name == second.name:
+                raise InputError(f"scenes: two folders are called '{first.name}', {first} and {second}: rename one")
+        for path in paths:
+            if not path.is_dir():
+                raise InputError(f"no such scene: '{path}': give --scene the folder of a capture")
+        configs: dict[CellKey, Config] = {}
+        for path, seed, variant in itertools.product(paths, self.seeds, ablation.only(self.only)):
+            config = variant_config(ablation, variant, seed, self.overrides, self.steps)
+            config.scene.path, config.train.device = str(path), resolve_device(self.device).type
+            configs[CellKey(path.name, variant, seed)] = config
+            shared = next(iter(configs.values())).scene
+            if (config.scene.factor, config.scene.test_every) != (shared.factor, shared.test_every):
+                raise InputError(f"variant '{variant}' changes the scene's photos, which all variants share")
+        return configs
+
+
+def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | None = None) -> list[Failure]:
+    """Train the cells that a study's folder has not yet, and write its report; the cells that broke.
+
+    A cell that breaks is kept as a failure and the others go on; the next call tries it again. The report is written
+    where the call is interrupted, too, of what is there.
+
+    Args:
+        gpus: number of this machine's GPUs, a process each; None: this process trains.
+
+    Raises:
+        InputError: anything wrong with the input (then nothing was trained), or a cell made with other settings.
+        TrainingStopped: no process can go on.
+    """
+    folder = StudyFolder(out)
+    folder.require_usable()
+    configs = choice.configs(ablation)
+    if folder.file.is_file():
+        folder.forget_failures()
+        _require_same_settings(folder, configs)
+    here = provenance(resolve_device(choice.device).type)
+    try:
+        if gpus is None:
+            train_cells(ablation, choice, folder, here)
+        else:
+            _train_on_gpus(gpus, (ablation, choice, folder, here))
+    finally:
+        study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
+        if study.results:
+            print(f"report  {write_report(folder)}")
+    return study.failures
+
+
+def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, here: Provenance) -> None:
+    """Train, in this process, the cells that the folder has not and no other process trains, until all are there.
+
+    Args:
+        here: machine and sources, as they were when the call began.
+
+    Raises:
+        InputError: a capture cannot be read, or is another one than the finished cells'.
+        TrainingStopped: the GPU no longer answers this process.
+    """
+    device, configs = resolve_device(choice.device), choice.configs(ablation)
+    finished = {result.key: result for result in folder.read_study().results} if folder.file.is_file() else {}
+    folder.write_study(Study(ablation, list(finished.values())))
+    left = {key: config for key, config in configs.items() if key not in finished}
+    if len(left) < len(configs):
+        _say(f"{len(configs) - len(left)} finished cells are kept")
+    warm: set[tuple[str, str]] = set()  # variants and captures
+    total, done, spent = len(left), 0, 0.0
+    while left:
+        waiting = True
+        for key, config in list(left.items()):
+            with folder.claimed(key) as mine:
+                if not mine:
+                    continue
+                del left[key]
+                waiting = False
+                if folder.ended(key):  # another process has trained it
+                    total -= 1
+                    continue
+                scene, digest, loading = _load_capture(config)
+                if any(cell.scene == key.scene and cell.capture not in ("", digest) for cell in finished.values()):
+                    raise InputError(
+                        f"'{key.scene}' has other photos or cameras than its kept cells: choose a new --out"
+                    )
+                started = time.perf_counter()
+                try:
+                    outcome: CellResult | Failure = train_cell(
+                        key.variant, config, scene, device, here, loading, (key.variant, key.scene) in warm
+                    )
+                    warm.add((key.variant, key.scene))
+                except Exception as error:  # whatever a variant breaks by, the other cells go on
+                    outcome = Failure(key, _reason(error))
+                folder.write(outcome)
+            done, spent = done + 1, spent + time.perf_counter() - started
+            seconds = round(spent / done * (total - done))
+            said = f"FAILED: {outcome.reason}" if isinstance(outcome, Failure) else outcome.text()
+            _say(f"[{done}/{total}] {key}: {said}; about {seconds // 60} min {seconds % 60:02d} s left")
+            if isinstance(outcome, Failure):
+                _require_working(device)
+        if waiting:
+            time.sleep(POLL_SECONDS)
+
+
+@lru_cache(maxsize=2)  # with refined cameras and without
+def _loaded(path: str, factor: int, test_every: int, refined: bool) -> tuple[Scene, str, float]:
+    started = time.perf_counter()
+    scene, cameras = load_and_find(Path(path), factor, test_every)
+    own = with_cameras(scene, cameras, refined)
+    return own, capture_digest(scene), time.perf_counter() - started
+
+
+def _load_capture(config: Config) -> tuple[Scene, str, float]:
+    """Capture of a cell, its digest, and the seconds in which it was loaded. It stays for the next cells."""
+    scene = config.scene
+    return _loaded(scene.path, scene.factor, scene.test_every, config.train.refine_cameras)
+
+
+def _reason(error: Exception) -> str:
+    """One line: what happened, and where unless the message is for the user."""
+    text = " ".join(str(error).split()) or "no message"
+    if isinstance(error, InputError | TrainingStopped):
+        return text
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {text[:500]} ({Path(frame.filename).name}:{frame.lineno})"
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(f"{text}\n")  # with its end, or the lines of two processes would stand on one
+    sys.stderr.flush()
+
+
+def _require_same_settings(folder: StudyFolder, configs: dict[CellKey, Config]) -> None:
+    for result in folder.read_study().results:
+        if result.key not in configs:
+            continue
+        asked = flat_settings(configs[result.key].to_mapping())
+        changed = [path for path in changes(asked, result.settings) if not path.startswith(OF_A_CALL)]
+        if changed:
+            raise InputError(
+                f"the cell '{result.key}' was made with other settings ({', '.join(changed[:4])}): choose a new --out"
+            )
+
+
+def _require_working(device: torch.device) -> None:
+    """After a failure: see whether the GPU still answers this process, and free the broken model's memory."""
+    try:
+        synchronize(device)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[0]
+        raise TrainingStopped(f"the GPU no longer answers this process ({reason}): the same command goes on") from None
+    free_device_memory(device)
+
+
+def _train_on_gpus(gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder, Provenance]) -> None:
+    """`train_cells` by a process for each GPU."""
+    if arguments[1].device != "cpu" and gpus > torch.cuda.device_count():
+        raise InputError(f"--gpus {gpus}: this machine has {torch.cuda.device_count()}; see 'turbogs doctor'")
+    try:
+        with ProcessPoolExecutor(gpus, multiprocessing.get_context("spawn")) as pool:
+            try:
+                for worker in [pool.submit(_work, gpu, gpus, arguments) for gpu in range(gpus)]:
+                    worker.result()
+            except KeyboardInterrupt:
+                for process in multiprocessing.active_children():
+                    process.terminate()
+                raise
+    except BrokenProcessPool:
+        raise TrainingStopped("a process of this study was killed: the same command goes on") from None
+
+
+def _work(gpu: int, gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder, Provenance]) -> None:
+    """Task of a process, before it starts CUDA. It ends with the process that started it."""
+    parent = multiprocessing.parent_process()
+    end_with_parent(lambda: parent is not None and parent.is_alive())
+    visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
+    os.environ["CUDA_VISIBLE_DEVICES"] = visible[gpu] if gpu < len(visible) else str(gpu)
+    # With as many threads as cores in each process, all would wait for one another at every parallel loop.
+    torch.set_num_threads(max(1, processor_cores() // gpus))
+    train_cells(*arguments)
