@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from turbogs_plugin.report.pictures import GAP
+from turbogs_plugin.report.images import GAP
 
 VIEWS = 2
 SCALE = 2

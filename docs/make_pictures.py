@@ -23,7 +23,7 @@ import numpy as np
 from PIL import Image
 from torch import Tensor
 
-from turbogs_plugin.report.pictures import GAP
+from turbogs_plugin.report.images import GAP
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.evaluate import Look, render_view
@@ -34,9 +34,9 @@ from turbogs_plugin.train.saved_model import SavedModel, load_model
 from turbogs_plugin.train.start import open_scene, resolve_device
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Color, Gaussians, PixelSamples, RowUpdate, Step
-from turbogs_plugin.viewer.eye import Eye
+from turbogs_plugin.viewer.camera import ViewerCamera
+from turbogs_plugin.viewer.model_state import CaptureViews, ModelState
 from turbogs_plugin.viewer.pictures import Picture, Request, draw
-from turbogs_plugin.viewer.subject import CaptureViews, Subject
 
 DOCS = Path(__file__).resolve().parent
 EARLY = 8
@@ -109,8 +109,8 @@ def main() -> None:
 
 
 def _render(model: SavedModel, scene: Scene, view: int) -> np.ndarray:
-    subject = Subject(model.gaussians, model.sh_degree, settings=model.config.raster)
-    return draw(subject, Request(Picture.RENDER, Eye.of_view(scene.train.cameras, view)))
+    subject = ModelState(model.gaussians, model.sh_degree, settings=model.config.raster)
+    return draw(subject, Request(Picture.RENDER, ViewerCamera.of_view(scene.train.cameras, view)))
 
 
 def _overlays(model: SavedModel, scene: Scene, view: int) -> tuple[np.ndarray, dict[str, object]]:
@@ -123,8 +123,8 @@ def _overlays(model: SavedModel, scene: Scene, view: int) -> tuple[np.ndarray, d
     views = replace(trainer.views, photos=Renders(trainer))
     state = {"capture": CaptureViews(views, views), "maps": trainer.maps, "step": trainer.now}
     samples = look.samples
-    subject = Subject(trainer.gaussians, trainer.sh_degree, settings=trainer.config.raster, samples=samples, **state)
-    eye = Eye.of_view(trainer.views.cameras, view)
+    subject = ModelState(trainer.gaussians, trainer.sh_degree, settings=trainer.config.raster, samples=samples, **state)
+    eye = ViewerCamera.of_view(trainer.views.cameras, view)
     rows, columns = _part((eye.width, eye.height))
     panels = [
         draw(subject, Request(picture, eye, view))[rows, columns] for picture in (Picture.ERRORS, Picture.SAMPLES)

@@ -16,8 +16,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-from turbogs_plugin.export.commands import PAGE, export_run, film_run
-from turbogs_plugin.export.film import RATE
+from turbogs_plugin.export.film import RATE, film_run
+from turbogs_plugin.export.model_export import PAGE, export_run
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.report.provenance import provenance

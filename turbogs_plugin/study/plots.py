@@ -20,7 +20,7 @@ from matplotlib.transforms import Bbox
 from PIL import Image, PngImagePlugin
 
 from turbogs_plugin.files import write_atomically
-from turbogs_plugin.report.plots import SECONDS_LABEL, STYLE
+from turbogs_plugin.report.curves import SECONDS_LABEL, STYLE
 from turbogs_plugin.study.statistics import pareto_front
 from turbogs_plugin.study.summary import SceneSummary, VariantRow
 

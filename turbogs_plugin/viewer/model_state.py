@@ -1,4 +1,4 @@
-"""What is looked at: a model, and where there is one, its capture and the state of its training."""
+"""The state that pictures show: a model, and where there is one, its capture and what its training keeps."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from turbogs_plugin.types import BLACK, Color, Gaussians, PixelSamples, RowUpdat
 
 @dataclass
 class DensityChange:
-    """What the last event of density control did.
+    """The last event of density control.
 
     Args:
-        iteration: when.
+        iteration: when it happened.
         added: [N] bool, rows of the present model that it made.
-        removed: the Gaussians that it took away; one that was split is replaced, not removed.
+        removed: the Gaussians that it took away; a Gaussian that was split is replaced, not removed.
         num_cloned, num_split, num_pruned: as in `RowUpdate`.
     """
 
@@ -42,7 +42,7 @@ class DensityChange:
 
 @dataclass(frozen=True)
 class CaptureViews:
-    """The views of a capture under one numbering: those for training, then those for testing.
+    """The views of a capture under one numbering: training views, then test views.
 
     Args:
         train, test: cameras and photos, wherever their photos are kept.
@@ -66,18 +66,18 @@ class CaptureViews:
 
 
 @dataclass
-class Subject:
-    """All that a picture may show. What is None is not there, and pictures that need it say so.
+class ModelState:
+    """All that a picture may show. Pictures that need what is None say so.
 
     Args:
         gaussians: the model, on the device that renders.
         sh_degree: highest degree of spherical harmonics in use.
-        settings: those of the rasterizer.
+        settings: of the rasterizer.
         background: behind the model, and behind transparent photos.
         capture: its views, for training and for testing.
         maps: errors and ages of the training views.
         step: the time from which ages count.
-        samples: those of the last iteration.
+        samples: pixels of the last iteration.
         change: the last event of density control.
     """
 
@@ -93,5 +93,5 @@ class Subject:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Of rendering."""
+        """Options of `render_image`."""
         return {"sh_degree": self.sh_degree, "settings": self.settings, "background": self.background}
