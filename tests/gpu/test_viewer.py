@@ -11,6 +11,7 @@ from turbogs_plugin.plan import make_plan
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.run import new_loop
+from turbogs_plugin.types import RowUpdate
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.model_state import CaptureViews, DensityChange, ModelState
 from turbogs_plugin.viewer.pictures import Picture, Request, draw
@@ -51,7 +52,8 @@ def subjects(request, tmp_path_factory) -> tuple[ModelState, ModelState]:
     here.samples, here.change = watcher.samples, watcher.change
     there = ModelState(trainer.gaussians.map(torch.Tensor.cpu), trainer.sh_degree, capture=CaptureViews(*split(scene)))
     change = watcher.change
-    there.change = DensityChange(change.iteration, change.added.cpu(), change.removed.map(torch.Tensor.cpu), 0, 0, 0)
+    update = RowUpdate(change.update.source.cpu(), change.update.fresh.cpu(), {})
+    there.change = DensityChange(change.iteration, update, change.removed.map(torch.Tensor.cpu))
     return here, there
 
 

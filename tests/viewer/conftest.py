@@ -56,17 +56,17 @@ def shown():
     """Shows a model on a page, from a thread of its own, while entered."""
     pytest.importorskip("viser")
     from turbogs_plugin.viewer.server import Page
-    from turbogs_plugin.viewer.show import Showing, Shown
+    from turbogs_plugin.viewer.show import server_of
 
     @contextmanager
     def shown(state: ModelState):
         over = threading.Event()
         with closing(Page("127.0.0.1", 0)) as page:
-            showing = Showing(Shown(state, "a model"), page)
+            draw_due = server_of(state, "a model", page)
 
             def serve() -> None:
                 while not over.is_set():
-                    if not showing.serve():
+                    if not draw_due():
                         page.controls.wait(0.05)
 
             thread = threading.Thread(target=serve)

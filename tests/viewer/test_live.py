@@ -2,14 +2,11 @@
 
 import threading
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from helpers.framework_runs import assert_identical
 
-from turbogs_plugin.train.clock import TrainingClock
 from turbogs_plugin.train.loop import Listener
 from turbogs_plugin.viewer import frames
 from turbogs_plugin.viewer import live as module
@@ -37,8 +34,6 @@ class PretendedPage:
         return bool(self._screens)
 
     def screens(self) -> list[Screen]:
-        for screen in self._screens:
-            screen.busy = False
         return self._screens
 
     def wish(self) -> tuple[Picture, int]:
@@ -113,8 +108,8 @@ def test_what_an_iteration_did_is_shown(watched):
     loop.run()
     (state,) = changes
     assert state.samples is not None and len(state.samples) > 0
-    assert len(state.change.added) == len(state.gaussians)
-    assert int(state.change.added.sum()) >= state.change.num_split > 0
+    assert len(state.change.update.fresh) == len(state.gaussians)
+    assert int(state.change.update.fresh.sum()) >= state.change.update.num_split > 0
 
 
 def test_pause_step_and_go_on(new_training, watched, monkeypatch):
@@ -150,19 +145,6 @@ def test_pause_step_and_go_on(new_training, watched, monkeypatch):
     alone = new_training()
     alone.run()
     assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())
-
-
-def test_the_clock_does_not_count_what_is_no_training(monkeypatch):
-    now = [0.0]
-    monkeypatch.setattr("turbogs_plugin.train.clock.time", SimpleNamespace(perf_counter=lambda: now[0]))
-    clock = TrainingClock(torch.device("cpu"), seconds=5.0)
-    with clock:
-        now[0] += 1.0
-        with clock.stopped():
-            now[0] += 100.0
-        now[0] += 2.0
-        assert clock.now() == 8.0
-    assert clock.seconds == 8.0
 
 
 def test_a_paused_training_can_be_stopped(watched, monkeypatch):
@@ -216,9 +198,3 @@ def test_steps_are_counted():
     assert controls.paused and controls.take_step() and controls.take_step() and not controls.take_step()
     controls.set_paused(False)
     assert not controls.paused
-
-
-def test_an_evaluation_is_told(watched):
-    _, live, loop = watched()
-    live.evaluated(loop, SimpleNamespace(psnr=21.5))
-    assert "21.50 dB" in live._status(loop.trainer, True, time.perf_counter())

@@ -20,7 +20,6 @@ from turbogs_plugin.viewer.pictures import (
     Picture,
     Request,
     draw,
-    fitted,
     missing,
     shown_view,
 )
@@ -88,19 +87,11 @@ def test_photo_render_and_error_stand_side_by_side(state):
     assert (found[:, width : width + GAP] == BACKGROUND).all()
 
 
-def test_a_tall_page_has_them_one_below_the_other(state):
-    eye = own_size(state)
-    tall = replace(eye, height=3 * eye.height + 2 * GAP)
-    found = draw(state, Request(Picture.COMPARE, tall, VIEW))
-    assert np.array_equal(found[: eye.height], to_uint8(state.capture.train.photos.image(VIEW)))
-
-
 def test_a_photo_stands_in_the_middle_and_keeps_its_proportions(state):
     eye = own_size(state)
     found = draw(state, Request(Picture.COMPARE, replace(eye, width=3 * eye.width + 2 * GAP + 20), VIEW))
     assert np.array_equal(found[:, 10 : 10 + eye.width], to_uint8(state.capture.train.photos.image(VIEW)))
     assert (found[:, :10] == BACKGROUND).all() and (found[:, -10:] == BACKGROUND).all()
-    assert fitted((48, 40), (480, 4000)) == (480, 400) and fitted((48, 40), (4000, 40)) == (48, 40)
 
 
 def test_the_error_map_is_bright_where_the_map_says_so(state):

@@ -22,7 +22,7 @@ from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.live import LiveViewer
 from turbogs_plugin.viewer.pictures import Picture, Request, draw
 from turbogs_plugin.viewer.server import INSTALL, Page, address, require_server
-from turbogs_plugin.viewer.show import open_shown
+from turbogs_plugin.viewer.show import open_state
 
 
 def connected(page: Page, **headers: str):
@@ -263,21 +263,21 @@ def test_a_model_from_a_file_stands_before_the_eye(state, tmp_path, name):
     far.means = far.means * 50.0 + torch.tensor([1000.0, -2000.0, 500.0])
     file = tmp_path / f"model{FORMATS[name].suffix}"
     FORMATS[name].write(far, file, Frame(np.zeros(3), 1.0), 0)
-    found = open_shown(file, torch.device("cpu"))
-    distances = found.state.gaussians.means.norm(dim=1)
+    found, _ = open_state(file, torch.device("cpu"))
+    distances = found.gaussians.means.norm(dim=1)
     assert 0.85 < float((distances <= 1.01).float().mean()) < 0.95
-    assert found.state.capture is None and found.title == file.name
+    assert found.capture is None
 
 
 def test_a_run_is_shown_with_its_error_maps_and_without_its_capture(turbogs, capture, tmp_path):
     out = tmp_path / "run"
     code, *_ = turbogs("train", capture, "--out", out, "--no-report", "--device", "cpu", *TINY)
     assert code == 0
-    found = open_shown(out, torch.device("cpu"))
-    assert len(found.state.capture) == 8 and found.note == "" and found.state.maps.errors.any()
-    eye = ViewerCamera.of_view(found.state.capture.train.cameras, 0)
-    assert draw(found.state, Request(Picture.AGES, eye, 0)).std() > 1
+    found, lacking = open_state(out, torch.device("cpu"))
+    assert len(found.capture) == 8 and lacking == "" and found.maps.errors.any()
+    eye = ViewerCamera.of_view(found.capture.train.cameras, 0)
+    assert draw(found, Request(Picture.AGES, eye, 0)).std() > 1
     config = out / "config.yaml"
     config.write_text(config.read_text().replace(str(capture), str(tmp_path / "gone")))
-    found = open_shown(out, torch.device("cpu"))
-    assert found.state.capture is None and "gone" in found.note
+    found, lacking = open_state(out, torch.device("cpu"))
+    assert found.capture is None and "gone" in lacking

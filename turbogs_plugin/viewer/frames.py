@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,14 +15,14 @@ from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.model_state import ModelState
 from turbogs_plugin.viewer.pictures import Picture, Request, draw
 
-SHARE = 0.07
-"""Share of the wall time that frames may take from a running training. The threads that encode and send them take some
-more; together they stay below 0.1."""
+SHARE = 0.08
+"""Share of the wall time that frames may take from a running training, drawn and encoded; with the thread of viser that
+sends them it stays below 0.1."""
 REST_SECONDS = 0.25
 """Seconds without a movement after which a camera is at rest."""
 SHORTEST_INTERVALS = {True: 1.0 / 15.0, False: 1.0 / 30.0}
-"""Seconds between two frames of one page, by whether a training runs beside: encoding and sending a frame take the
-interpreter from the training for a moment that no clock here sees."""
+"""Seconds between two frames of one page, by whether a training runs beside: sending a frame takes the interpreter from
+the training for a moment that no clock here sees."""
 FRAME_SECONDS = {(True, True): 0.1 * SHARE, (True, False): 0.5 * SHARE, (False, True): 0.1, (False, False): 5.0}
 """Seconds that a frame may take, by whether a training runs beside and whether the camera moves."""
 FEWEST_PIXELS = 160 * 120
@@ -33,24 +34,20 @@ class Screen:
     """One page: what it wants to see, and what it was sent.
 
     Args:
-        send: takes a picture [H, W, 3] uint8 and whether to send it without loss. It returns at once.
+        send: encodes a picture [H, W, 3] uint8, without loss or not, and sends it.
 
     Attributes:
         camera: None until the client has told a usable one.
         moved_at: when the camera last changed.
-        busy: a picture is still being encoded; the encoder sets it back.
-        sent: what was sent last, and whether without loss; None: nothing.
+        sent: what was drawn last; None: nothing.
         served_at: when it was sent.
-        failed: why the last frame was not drawn, in words; empty where it was.
     """
 
     send: Callable[[np.ndarray, bool], None]
     camera: ViewerCamera | None = None
     moved_at: float = -math.inf
-    busy: bool = False
     sent: tuple | None = None
     served_at: float = -math.inf
-    failed: str = ""
 
     def look(self, camera: ViewerCamera | None, now: float) -> None:
         """Take the client's camera; None changes nothing."""
@@ -93,15 +90,15 @@ class Frames:
             return False
         picture, view = self.wish()
         for screen in sorted(self.screens(), key=lambda screen: screen.served_at):
-            if screen.camera is None or screen.busy or now < screen.served_at + SHORTEST_INTERVALS[running]:
+            if screen.camera is None or now < screen.served_at + SHORTEST_INTERVALS[running]:
                 continue
             moving = now - screen.moved_at < REST_SECONDS
-            wanted = (picture, view, screen.camera, version, running)
-            if screen.sent == (wanted, True) or (moving and screen.sent == (wanted, False)):
+            wanted = (picture, view, screen.camera, version, running, moving)
+            if screen.sent == wanted or (moving and screen.sent == (*wanted[:-1], False)):
                 continue
             request = Request(picture, self._sized(picture, screen.camera, moving, running), view)
-            screen.sent, screen.served_at = (wanted, not moving), now
-            self._draw(screen, state(), request, not moving)
+            screen.sent, screen.served_at = wanted, now
+            self._draw(screen, state(), request, lossless=not (moving or running))
             return True
         return False
 
@@ -118,13 +115,8 @@ class Frames:
 
     def _draw(self, screen: Screen, state: ModelState, request: Request, lossless: bool) -> None:
         begun = self.clock()
-        try:
-            pixels, screen.failed = draw(state, request), ""
-        except torch.cuda.OutOfMemoryError:  # the training has what it needs; a page can wait
-            screen.failed = "The device has too little free memory for this picture."
-        else:
-            screen.busy = True
-            screen.send(pixels, lossless)
+        with suppress(torch.cuda.OutOfMemoryError):  # the training has what it needs; a page can wait
+            screen.send(draw(state, request), lossless)
         seconds = self.clock() - begun
         self.next_at = begun + seconds / SHARE
         known = self._per_pixel.get(request.picture)

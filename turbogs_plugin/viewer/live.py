@@ -159,12 +159,13 @@ def described(state: ModelState, page: Page) -> list[str]:
     request = Request(picture, cameras[0], view)
     if reason := missing(state, request):
         return [f"*{reason}*"]
-    lines = [f"*{screen.failed}*" for screen in page.screens() if screen.failed]
+    lines = []
     if picture.of_view and state.capture is not None:
         lines.append(f"`{plain(state.capture.name(shown_view(state, request)))}`")
     if picture is Picture.SAMPLES and (samples := state.samples) is not None:
         lines.append(f"{len(samples):,} pixels of {len(samples.view_ids)} views in this iteration")
     if picture is Picture.CHANGES and (change := state.change) is not None:
-        counts = f"{change.num_split:,} split, {change.num_cloned:,} copied, {change.num_pruned:,} removed"
+        did = change.update
+        counts = f"{did.num_split:,} split, {did.num_cloned:,} copied, {did.num_pruned:,} removed"
         lines.append(f"iteration {change.iteration}: {counts}")
     return lines

@@ -19,25 +19,20 @@ class DensityChange:
 
     Args:
         iteration: when it happened.
-        added: [N] bool, rows of the present model that it made.
+        update: what it did; its `fresh` are the rows of the present model that it added.
         removed: the Gaussians that it took away; a Gaussian that was split is replaced, not removed.
-        num_cloned, num_split, num_pruned: as in `RowUpdate`.
     """
 
     iteration: int
-    added: torch.Tensor
+    update: RowUpdate
     removed: Gaussians
-    num_cloned: int
-    num_split: int
-    num_pruned: int
 
     @classmethod
     def of(cls, before: Gaussians, update: RowUpdate, iteration: int) -> DensityChange:
         """The change that `update` makes to the model `before` it."""
         gone = torch.ones(len(before), dtype=torch.bool, device=before.device)
         gone[update.source] = False
-        removed = before.map(lambda value: value[gone])
-        return cls(iteration, update.fresh, removed, update.num_cloned, update.num_split, update.num_pruned)
+        return cls(iteration, update, before.map(lambda value: value[gone]))
 
 
 @dataclass(frozen=True)

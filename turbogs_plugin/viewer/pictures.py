@@ -96,7 +96,7 @@ def draw(state: ModelState, request: Request) -> np.ndarray:
 def missing(state: ModelState, request: Request) -> str:
     """Why a picture cannot be drawn, in a sentence for the page; empty if it can."""
     picture = request.picture
-    if picture is Picture.CHANGES and (state.change is None or len(state.change.added) != len(state.gaussians)):
+    if picture is Picture.CHANGES and (state.change is None or len(state.change.update.fresh) != len(state.gaussians)):
         return "No change yet: wait for the next event of density control of a running training."
     if not picture.of_view:
         return ""
@@ -121,10 +121,11 @@ def shown_view(state: ModelState, request: Request) -> int:
     return view
 
 
-def fitted(size: tuple[int, int], box: tuple[int, int]) -> tuple[int, int]:
-    """The largest (width, height) with the proportions of `size` within a box."""
-    scale = min(box[0] / size[0], box[1] / size[1])
-    return max(1, min(box[0], round(size[0] * scale))), max(1, min(box[1], round(size[1] * scale)))
+def _fitted(size: np.ndarray, request: Request, panels: int = 1) -> tuple[int, int]:
+    """The largest (width, height) with the proportions of `size` [2], so that panels fit side by side into the page."""
+    width, height = max(1, (request.camera.width - (panels - 1) * GAP) // panels), request.camera.height
+    scale = min(width / size[0], height / size[1])
+    return max(1, min(width, round(size[0] * scale))), max(1, min(height, round(size[1] * scale)))
 
 
 def _render(state: ModelState, request: Request) -> np.ndarray:
@@ -144,7 +145,7 @@ def _changes(state: ModelState, request: Request) -> np.ndarray:
     model, change = state.gaussians, state.change
     assert change is not None
     colors = (SH_C0 * model.sh0[:, 0] + 0.5).clamp(0.0, 1.0).mean(dim=1, keepdim=True) * DIMMED
-    colors = torch.where(change.added[:, None], colors.new_tensor(ADDED), colors.expand(-1, 3))
+    colors = torch.where(change.update.fresh[:, None], colors.new_tensor(ADDED), colors.expand(-1, 3))
     colors = torch.cat([colors, colors.new_tensor(REMOVED).expand(len(change.removed), 3)])
     removed = dict(change.removed.items())
     both = Gaussians(**{name: torch.cat([value, removed[name]]) for name, value in model.items()})
@@ -154,18 +155,13 @@ def _changes(state: ModelState, request: Request) -> np.ndarray:
 
 
 def _compare(state: ModelState, request: Request) -> np.ndarray:
-    """Photo, render and error, side by side or one below the other, whichever is larger."""
-    width, height = request.camera.width, request.camera.height
-    views, view_id, wide = _fitted_view(state, request, (max(1, (width - 2 * GAP) // 3), height))
-    _, _, tall = _fitted_view(state, request, (width, max(1, (height - 2 * GAP) // 3)))
-    beside = wide >= tall
-    size = wide if beside else tall
+    """Photo, render and error, side by side."""
+    views, view_id, size = _fitted_view(state, request, panels=3)
     photo = _photo_of(state, views, view_id, size)
     image = _render_of(state, views, view_id, size)
-    gap = torch.full((size[1], GAP, 3) if beside else (GAP, size[0], 3), BACKGROUND, dtype=torch.uint8)
-    gap = gap.to(photo.device)
+    gap = torch.full((size[1], GAP, 3), BACKGROUND, dtype=torch.uint8, device=photo.device)
     parts = (rounded(photo), gap, rounded(image), gap, error_picture(photo, image.clamp(0.0, 1.0)))
-    return _centred(torch.cat(parts, dim=1 if beside else 0), request)
+    return _centred(torch.cat(parts, dim=1), request)
 
 
 def _errors(state: ModelState, request: Request) -> np.ndarray:
@@ -218,13 +214,11 @@ def _maps(state: ModelState) -> tuple[ErrorMaps, Step]:
     return state.maps, state.step
 
 
-def _fitted_view(
-    state: ModelState, request: Request, box: tuple[int, int] | None = None
-) -> tuple[PosedImages, int, tuple[int, int]]:
-    """The set of the view that is shown, its number there, and its (width, height) within a box, or within the page."""
+def _fitted_view(state: ModelState, request: Request, panels: int = 1) -> tuple[PosedImages, int, tuple[int, int]]:
+    """The set of the view that is shown, its number there, and its (width, height) where several panels stand side by
+    side in the page."""
     views, view_id = _capture(state).find(shown_view(state, request))
-    width, height = views.cameras.sizes[view_id].tolist()
-    return views, view_id, fitted((width, height), box or (request.camera.width, request.camera.height))
+    return views, view_id, _fitted(views.cameras.sizes[view_id], request, panels)
 
 
 def _photo_of(state: ModelState, views: PosedImages, view_id: int, size: tuple[int, int]) -> Tensor:
@@ -251,9 +245,9 @@ def _render_of(state: ModelState, views: PosedImages, view_id: int, size: tuple[
 
 def _map_picture(share: Tensor, state: ModelState, request: Request) -> np.ndarray:
     """A map [H * W] of the view shown, fitted into the page; what is reduced keeps its largest values."""
-    width, height = _maps(state)[0].sizes[shown_view(state, request)].tolist()
-    size = fitted((width, height), (request.camera.width, request.camera.height))
-    return _centred(colored(_resized(share.view(1, height, width), size, adaptive_max_pool2d)[0]), request)
+    own = _maps(state)[0].sizes[shown_view(state, request)]
+    plane = share.view(1, int(own[1]), int(own[0]))
+    return _centred(colored(_resized(plane, _fitted(own, request), adaptive_max_pool2d)[0]), request)
 
 
 def _resized(planes: Tensor, size: tuple[int, int], reduce: Callable | None = None) -> Tensor:

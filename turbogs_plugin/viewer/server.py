@@ -1,7 +1,7 @@
 """The web page of the viewer, a viser server: its panel, its clients, the cameras of the capture.
 
-viser calls back from threads of its own; these only take down what a client wants. Drawing happens on the thread that
-owns the model (`frames`), encoding in one more thread, which waits for neither.
+viser calls back from threads of its own; these only take down what a client wants. Drawing and encoding happen on the
+thread that owns the model (`frames`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -147,7 +147,6 @@ class Page:
         self._screens: dict[int, Screen] = {}
         self._frusta: list[Any] = []
         self.server = quiet_server(host, port)
-        self._encoder = ThreadPoolExecutor(1, thread_name_prefix="turbogs-viewer")
         _guard(self.server)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self.server.gui.main_panel.dock_right()
@@ -232,7 +231,6 @@ class Page:
     def close(self) -> None:
         """Turn everybody away."""
         self._screens.clear()
-        self._encoder.shutdown(wait=True, cancel_futures=True)
         stop(self.server)
 
     def _build_panel(self, training: bool) -> None:
@@ -286,7 +284,7 @@ class Page:
             client.camera.fov = camera.fov
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        screen = Screen(lambda pixels, lossless: self._send(client, screen, pixels, lossless))
+        screen = Screen(partial(self._send, client))
         self._screens[client.client_id] = screen
         client.camera.on_update(lambda camera: self._looked(screen, camera))
         self._looked(screen, client.camera)
@@ -300,19 +298,10 @@ class Page:
         screen.look(ViewerCamera.checked(camera.position, camera.wxyz, camera.fov, *size), time.perf_counter())
         self.controls.wake()
 
-    def _send(self, client: viser.ClientHandle, screen: Screen, pixels: np.ndarray, lossless: bool) -> None:
-        def encode() -> None:
-            try:
-                if client.client_id in self._screens:
-                    client.scene.set_background_image(
-                        pixels, format="png" if lossless else "jpeg", jpeg_quality=JPEG_QUALITY
-                    )
-            finally:
-                screen.busy = False
-                self.controls.wake()
-
-        with contextlib.suppress(RuntimeError):  # the page is closing
-            self._encoder.submit(encode)
+    def _send(self, client: viser.ClientHandle, pixels: np.ndarray, lossless: bool) -> None:
+        if client.client_id in self._screens:
+            kind: Literal["png", "jpeg"] = "png" if lossless else "jpeg"
+            client.scene.set_background_image(pixels, format=kind, jpeg_quality=JPEG_QUALITY)
 
 
 def _guard(server: Any) -> None:

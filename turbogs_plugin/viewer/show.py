@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,21 +32,6 @@ FIRST_DISTANCE = 2.5
 """Distance of the first camera from a model without a capture, most of which lies within 1 of its middle."""
 
 
-@dataclass(frozen=True)
-class Shown:
-    """A model to look at.
-
-    Args:
-        state: the model with what is known of it.
-        title: for the page.
-        note: what is lacking, in a line; empty if nothing is.
-    """
-
-    state: ModelState
-    title: str
-    note: str = ""
-
-
 def view(path: Path, port: int, host: str, device_name: str, given: Config | None = None) -> None:
     """Show a run's newest model, or one from a file, until Ctrl-C.
 
@@ -61,57 +46,49 @@ def view(path: Path, port: int, host: str, device_name: str, given: Config | Non
         InputError: no model there, viser is not installed, or the port is not free.
     """
     require_server(host, port)
-    shown = open_shown(path, resolve_device(device_name), given)
+    state, lacking = open_state(path, resolve_device(device_name), given)
     with closing(Page(host, port)) as page:
-        if shown.note:
-            print(f"turbogs: {shown.note}", file=sys.stderr)
-        serve_until_interrupted(page, Showing(shown, page).serve)
+        if lacking:
+            print(f"turbogs: shown without its capture: {lacking}", file=sys.stderr)
+        serve_until_interrupted(page, server_of(state, path.name, page))
 
 
-class Showing:
-    """A model on a page.
+def server_of(state: ModelState, title: str, page: Page) -> Callable[[], bool]:
+    """A function that draws a frame of a model if one is due, and says whether it did."""
+    frames = Frames(page.screens, page.wish)
+    line = f"**{plain(title)}** · {len(state.gaussians):,} Gaussians"
+    if state.capture is not None:
+        page.show_capture(state.capture)
+    else:  # which way is up is not known: y is taken as down, as most reconstructions have it
+        page.server.scene.set_up_direction("-y")
+        front = (0.0, 0.0, -FIRST_DISTANCE), (1.0, 0.0, 0.0, 0.0), math.radians(60.0)
+        page.stand_at(ViewerCamera(*front, 640, 480), FIRST_DISTANCE)
 
-    Args:
-        shown: the model.
-        page: without controls of a training.
-    """
-
-    def __init__(self, shown: Shown, page: Page) -> None:
-        self._state, self._page, self._frames = shown.state, page, Frames(page.screens, page.wish)
-        self._line = f"**{plain(shown.title)}** · {len(shown.state.gaussians):,} Gaussians"
-        if shown.state.capture is not None:
-            page.show_capture(shown.state.capture)
-        else:  # which way is up is not known: y is taken as down, as most reconstructions have it
-            page.server.scene.set_up_direction("-y")
-            front = (0.0, 0.0, -FIRST_DISTANCE), (1.0, 0.0, 0.0, 0.0), math.radians(60.0)
-            page.stand_at(ViewerCamera(*front, 640, 480), FIRST_DISTANCE)
-
-    def serve(self) -> bool:
-        """Draw a frame if one is due; whether it was."""
-        drawn = self._frames.serve(lambda: self._state, 0, running=False)
-        self._page.say("\n\n".join([self._line, *described(self._state, self._page)]))
+    def serve() -> bool:
+        drawn = frames.serve(lambda: state, 0, running=False)
+        page.say("\n\n".join([line, *described(state, page)]))
         return drawn
 
+    return serve
 
-def open_shown(path: Path, device: torch.device, given: Config | None = None) -> Shown:
-    """The model to look at, on a device; its photos stay in host memory.
+
+def open_state(path: Path, device: torch.device, given: Config | None = None) -> tuple[ModelState, str]:
+    """The model to look at, on a device, its photos in host memory; and why its capture is absent, or "".
 
     Raises:
         InputError: there is no usable model, or no usable capture where one was named.
     """
     if given is None and not path.is_dir():
         gaussians = _centred(read_given(path), path).map(lambda value: value.to(device))
-        return Shown(ModelState(gaussians, gaussians.sh_degree), path.name)
+        return ModelState(gaussians, gaussians.sh_degree), ""
     model, scene, absent = load_with_capture(path, given, device, needed=False)
     look = model.own_look(None if scene is None else scene.train)
     state = ModelState(model.gaussians, look.sh_degree, look.settings, look.background)
-    title = path.name if given is not None else f"{path.name}, iteration {model.iteration}"
-    if scene is None:
-        return Shown(state, title, f"shown without its capture: {absent}")
-    state.capture = CaptureViews(scene.train, scene.test)
-    if given is None:
-        _take_saved_maps(state, path, scene, model)
-    return Shown(state, title)
+    if scene is not None:
+        state.capture = CaptureViews(scene.train, scene.test)
+        if given is None:
+            _take_saved_maps(state, path, scene, model)
+    return state, absent
 
 
 def _centred(gaussians: Gaussians, path: Path) -> Gaussians:
