@@ -1,18 +1,15 @@
-"""The page in a real browser: frames arrive as they were drawn, pictures switch, a training is paused and goes on."""
+"""The page in a real browser: frames arrive as they were drawn, and pictures switch."""
 
 import dataclasses
 import io
 import shutil
-import threading
 import time
 
 import numpy as np
 import pytest
-from helpers.framework_runs import assert_identical
 from PIL import Image
 
 from turbogs_plugin.viewer.camera import ViewerCamera
-from turbogs_plugin.viewer.live import LiveViewer
 from turbogs_plugin.viewer.pictures import Picture, Request, draw
 from turbogs_plugin.viewer.server import Page
 
@@ -92,34 +89,3 @@ def test_frames_arrive_as_they_were_drawn_and_pictures_switch(browser, shown, st
             tab.choose(picture)
             # A colour of a scale may jump with the last digit of a pose: so by the pose that the browser told.
             tab.comes_to_show(lambda *size, picture=picture: draw(state, Request(picture, page.screens()[0].camera, 6)))
-
-
-def test_a_training_is_paused_stepped_and_goes_on(browser, new_training, scene):
-    alone = new_training()
-    alone.run()
-    loop, page = new_training(), Page("127.0.0.1", 0, training=True)
-    loop.listeners.append(LiveViewer(page).attach(loop.trainer, scene.test))
-    page.controls.set_paused(True)
-    page.refresh_controls()
-    tab = Tab(browser, page)
-    thread = threading.Thread(target=loop.run)
-    thread.start()
-    try:
-        tab.tab.get_by_text("paused").wait_for(timeout=1000 * PATIENCE)
-        assert loop.trainer.iteration == 1
-        for iteration in (2, 3):
-            tab.press("One step")
-            tab.tab.get_by_text(f"iteration {iteration} of {loop.trainer.iterations} (paused)").wait_for(
-                timeout=1000 * PATIENCE
-            )
-            assert loop.trainer.iteration == iteration
-        tab.choose(Picture.SAMPLES)
-        tab.tab.get_by_text("views in this iteration").wait_for(timeout=1000 * PATIENCE)
-        tab.press("Go on")
-        thread.join(PATIENCE)
-        assert loop.finished
-    finally:
-        loop.stop()
-        thread.join()
-        page.close()
-    assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())

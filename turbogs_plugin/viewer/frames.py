@@ -16,8 +16,8 @@ from turbogs_plugin.viewer.model_state import ModelState
 from turbogs_plugin.viewer.pictures import Picture, Request, draw
 
 SHARE = 0.08
-"""Share of the wall time that frames may take from a running training, drawn and encoded; with the thread of viser that
-sends them it stays below 0.1."""
+"""Share of the wall time that frames may take from a running training, drawn and encoded; viser sends them in a thread
+of its own."""
 REST_SECONDS = 0.25
 """Seconds without a movement after which a camera is at rest."""
 SHORTEST_INTERVALS = {True: 1.0 / 15.0, False: 1.0 / 30.0}
