@@ -118,7 +118,7 @@ def export(
             which needs --no-normalize-world-space to take it. compressed-ply, splat, spz: smaller, with some loss.
             html: a page with the model to turn in a browser, without a network.
         out: new file; model.ply, model.pt, ..., or model.html in the run's folder where absent.
-        max_gaussians: at most so many, those that add most to the training views.
+        max_gaussians: largest number of Gaussians; those are kept that add most to the training views.
         cameras: give each photo of a capture a refined camera of its own, and write a capture to train on, with
             sparse/0 and links to the photos, into the new folder --out. Trainers must read the principal point of each
             camera: gsplat's does, LiteGS and 3DGS's own do not.

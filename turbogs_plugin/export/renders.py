@@ -25,7 +25,7 @@ def render_run(
     out: Path | None = None,
 ) -> list[Path]:
     """Write the views of a split, rendered from a run's newest model or a given one, as PNGs, and say what was done
-    with the capture's photos: where they were undistorted, the views are those of the undistorted cameras.
+    with the capture's photos: where they were undistorted, the cameras are, too.
 
     Args:
         path: folder of the run, or the file of a model.
