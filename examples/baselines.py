@@ -10,7 +10,7 @@ import tyro
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.scaling import with_iterations
-from turbogs_plugin.report.pages import write_report
+from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene.demo import write_demo_capture
 from turbogs_plugin.train import run
 

@@ -5,7 +5,6 @@ import gc
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -44,12 +43,10 @@ def drawn() -> None:
 
 @pytest.fixture
 def plotted(request, monkeypatch) -> None:
-    """Plots are made, with all that they show, but neither laid out nor rasterised, which takes a second a report, nor
-    in a process of their own, which takes two to start; not with `drawn`."""
+    """Plots are made, with all that they show, but neither laid out nor rasterised, which takes a second a report; not
+    with `drawn`."""
     from matplotlib.figure import Figure
     from PIL import Image
-
-    from turbogs_plugin.report import plot_process
 
     def save(figure: Figure, file: object, **options: object) -> None:
         Image.new("RGB", (8, 8)).save(file, "PNG")
@@ -57,7 +54,6 @@ def plotted(request, monkeypatch) -> None:
     if "drawn" not in request.fixturenames:
         monkeypatch.setattr(Figure, "savefig", save)
         monkeypatch.setattr(Figure, "draw_without_rendering", lambda figure: None)
-        monkeypatch.setattr(plot_process, "PlotProcess", nullcontext)
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """The command line: bad input is one line on stderr, exit code 2, and nothing written."""
 
-import gc
 import os
 import re
 import shutil
@@ -18,9 +17,8 @@ from PIL import Image
 
 from turbogs_plugin import __version__, cli, scene
 from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.export.renders import distinct_stems
 from turbogs_plugin.model.ply import load_ply
-from turbogs_plugin.report import plot_process
-from turbogs_plugin.report.outputs import distinct_stems
 from turbogs_plugin.train import run, start
 from turbogs_plugin.train.trainer import Trainer
 
@@ -428,10 +426,10 @@ def test_a_finished_run_is_evaluated_rendered_and_exported(turbogs, finished, tm
 
 def test_a_report_links_the_page_only_where_it_is_there(turbogs, finished, tmp_path):
     run = Path(shutil.copytree(finished, tmp_path / "run"))
-    assert "](report.html)" not in (run / "report.md").read_text()
-    (run / "report.html").touch()
+    assert "](model.html)" not in (run / "report.md").read_text()
+    (run / "model.html").touch()
     (run / "report.md").unlink()
-    assert turbogs("train", "--resume", run)[0] == 0 and "](report.html)" in (run / "report.md").read_text()
+    assert turbogs("train", "--resume", run)[0] == 0 and "](model.html)" in (run / "report.md").read_text()
 
 
 def test_depth_images_are_in_the_captures_own_units(turbogs, capture, finished):
@@ -470,33 +468,6 @@ def test_doctor(turbogs):
     assert code == 0
     for word in ("torch", "gsplat", "Python", "GPU", "kernels", "nvcc"):
         assert word in out
-
-
-@pytest.mark.usefixtures("drawn")
-@pytest.mark.parametrize("ends", ["draws", "fails", "is not asked for"])
-def test_plots_are_drawn_by_a_process_that_begins_before_photos_are_read(turbogs, capture, tmp_path, monkeypatch, ends):
-    made, drawn = [], []
-
-    class Process(plot_process.PlotProcess):
-        def __init__(self):
-            made.append(self)
-            super().__init__()
-
-        def end(self) -> bool:
-            return super().end() and ends == "draws"
-
-    draw, read = plot_process.SecondsPlot.draw, start.load_and_find
-    monkeypatch.setattr(plot_process, "PlotProcess", Process)
-    monkeypatch.setattr(plot_process.SecondsPlot, "draw", lambda plot: (drawn.append(plot), draw(plot)))
-    monkeypatch.setattr(start, "load_and_find", lambda *a, **b: (made.append("photos"), read(*a, **b))[1])
-    option = "--no-report" if ends == "is not asked for" else "--report"
-    code, _, err = turbogs("train", capture, "--out", tmp_path / "run", option, "--device", "cpu", *QUICK)
-    assert code == 0, err
-    assert len(drawn) == (2 if ends == "fails" else 0)
-    assert made[-1] == "photos" and len(made) == (1 if ends == "is not asked for" else 2)
-    names = ("report/psnr.png", "report/l1.png")
-    assert all((tmp_path / "run" / name).is_file() for name in names) == (ends != "is not asked for")
-    assert gc.isenabled()
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypatch):

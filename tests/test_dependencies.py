@@ -146,7 +146,6 @@ def test_the_extra_is_what_the_commands_name(project):
 COMMANDS = {
     "train": ("SCENE", "--out", "RUN"),
     "reconstruct": ("PHOTOS", "--out", "SCENE"),
-    "refine": ("SCENE", "--out", "NEW"),
     "plan": ("SCENE",),
     "view": ("RUN",),
     "eval": ("RUN",),
@@ -264,7 +263,7 @@ def test_the_core_changes_no_package_of_a_host(host, project):
 
 
 def test_the_viewers_extra_is_the_one_that_its_message_names(project):
-    from turbogs_plugin.viewer.page import INSTALL
+    from turbogs_plugin.viewer.server import INSTALL
 
     assert set(requirements(project["optional-dependencies"]["viewer"])) == {"viser"}
     assert f'"{project["name"]}[viewer]"' in INSTALL

@@ -34,10 +34,10 @@ ROOMS = (
     "train.trainer",
     "train.loop",
     "train.run",
-    "report.pages",
+    "report.run_report",
     "report.tensorboard",
-    "report.outputs",
-    "export.commands",
+    "report.evaluation",
+    "export.model_export",
 )
 
 RUN = """

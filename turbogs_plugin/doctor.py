@@ -11,10 +11,10 @@ import torch
 from packaging.requirements import Requirement
 
 from turbogs_plugin.engine import compiled_kernels
-from turbogs_plugin.report.machine import hardware, missing_bytecode, software
+from turbogs_plugin.report.provenance import hardware, missing_bytecode, software
 from turbogs_plugin.train.evaluate import LPIPS_PACKAGES
 from turbogs_plugin.train.flip import load_flip
-from turbogs_plugin.viewer.page import INSTALL as INSTALL_VIEWER
+from turbogs_plugin.viewer.server import INSTALL as INSTALL_VIEWER
 
 REQUIREMENTS = (
     "pycolmap>=4.0",

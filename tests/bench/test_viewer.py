@@ -8,7 +8,7 @@ from helpers.framework_runs import TINY, tiny_capture
 
 from turbogs_plugin.bench.viewer import WAYS, ViewerRun, summarised, viewer_lines
 from turbogs_plugin.bench.viewer_client import turning
-from turbogs_plugin.viewer.eye import Eye
+from turbogs_plugin.viewer.camera import ViewerCamera
 
 
 def test_the_ways_stand_side_by_side():
@@ -32,7 +32,7 @@ def test_changes_are_those_beside_the_run_of_the_same_repeat():
 
 
 def test_the_client_moves_and_comes_back():
-    eye = Eye((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), 1.0, 64, 48)
+    eye = ViewerCamera((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), 1.0, 64, 48)
     half, whole = turning(eye, 1.0), turning(eye, 2.0)
     assert math.dist(half.position, whole.position) == pytest.approx(0.1)
     assert math.dist(whole.position, turning(eye, 0.0).position) < 1e-9

@@ -5,7 +5,7 @@ from helpers.raster_cases import GPU_ONLY
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS
-from turbogs_plugin.export.contribution import contributions, pruned
+from turbogs_plugin.export.model_export import contributions, pruned
 
 pytestmark = GPU_ONLY
 

@@ -23,7 +23,7 @@ PRELOADED = [
     "torch",
     "torch.fx.experimental.symbolic_shapes",  # and sympy: the first gradient of each process would import them
     "turbogs_plugin.train.run",
-    "turbogs_plugin.report.pages",
+    "turbogs_plugin.report.run_report",
     "turbogs_plugin.cli",
     "turbogs_plugin.strategies.density.error_driven",
     "pycolmap",

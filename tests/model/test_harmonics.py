@@ -1,17 +1,11 @@
 """Bands of spherical harmonics that an export leaves out."""
 
-import shutil
-from pathlib import Path
-
 import pytest
 import torch
-from helpers.framework_runs import tiny_capture, tiny_config
 
 from turbogs_plugin.engine.reference.spherical_harmonics import evaluate
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
-from turbogs_plugin.model.ply import load_ply
-from turbogs_plugin.train import run
 from turbogs_plugin.types import Gaussians
 
 
@@ -97,54 +91,3 @@ def test_what_is_transparent_or_not_finite_does_not_count():
 def test_a_threshold_out_of_range_is_refused(threshold):
     with pytest.raises(InputError, match="threshold"):
         drop_faint_bands(model(0.5), threshold)
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("bands")
-    # Degree 2 is never opened: its coefficients are zero.
-    short = ("train.iterations=6", "train.sh_interval=5", "train.evaluate_at=[]")
-    run.train(tiny_config(tiny_capture(folder), *short), folder / "run")
-    return folder / "run"
-
-
-def rest_properties(path: Path) -> int:
-    header = path.read_bytes().partition(b"end_header")[0].decode()
-    return header.count("property float f_rest_")
-
-
-def test_an_export_has_fewer_properties_and_reads_back(turbogs, finished, tmp_path):
-    whole = load_ply(finished / "model.ply")
-    assert rest_properties(finished / "model.ply") == 24
-    for threshold, rest, words in (("0", 9, "degree 2 -> 1"), ("0.5", 0, "degree 2 -> 0"), (None, 24, "")):
-        target = tmp_path / f"{rest}.ply"
-        options = [] if threshold is None else ["--drop-bands", threshold]
-        code, out, err = turbogs("export", finished, "--out", target, *options)
-        assert code == 0 and words in out, err
-        assert rest_properties(target) == rest
-        read = load_ply(target)
-        assert torch.equal(read.shN, whole.shN[:, : rest // 3]) and torch.equal(read.sh0, whole.sh0)
-        assert torch.equal(read.means, whole.means)
-    assert (tmp_path / "0.ply").stat().st_size < (tmp_path / "24.ply").stat().st_size
-
-
-def test_an_export_never_takes_the_place_of_the_runs_model(turbogs, finished):
-    before = (finished / "model.ply").read_bytes()
-    code, out, err = turbogs("export", finished, "--drop-bands", "0.5")
-    assert code == 2 and out == "" and "--drop-bands would take the place of the run's own model.ply" in err
-    assert (finished / "model.ply").read_bytes() == before
-
-
-def test_an_export_refuses_a_threshold_out_of_range(turbogs, finished, tmp_path):
-    code, out, err = turbogs("export", finished, "--out", tmp_path / "a.ply", "--drop-bands", "1.5")
-    assert code == 2 and out == "" and "--drop-bands 1.5" in err and not (tmp_path / "a.ply").exists()
-
-
-def test_bands_that_are_needed_stay(turbogs, finished, tmp_path):
-    broken = Path(shutil.copytree(finished, tmp_path / "copy"))
-    checkpoint = next((broken / "checkpoints").glob("*.pt"))
-    state = torch.load(checkpoint)
-    state["trainer"]["gaussians"]["shN"][:, -1] = 1.0
-    torch.save(state, checkpoint)
-    code, out, _ = turbogs("export", broken, "--out", tmp_path / "a.ply", "--drop-bands", "0.01")
-    assert code == 0 and "degree 2 stays" in out and rest_properties(tmp_path / "a.ply") == 24

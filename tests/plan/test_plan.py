@@ -16,7 +16,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan import Plan, SceneFacts
 from turbogs_plugin.plan.decisions import RULES
 from turbogs_plugin.plan.plan import plan_from_facts
-from turbogs_plugin.report.pages import write_report
+from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.study.results import StudyFolder
 from turbogs_plugin.train import run

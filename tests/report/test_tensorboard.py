@@ -29,7 +29,7 @@ class Recorder:
 
     def __init__(self, folder: str, purge_step: int) -> None:
         self.folder, self.purge_step = folder, purge_step
-        self.scalars, self.images, self.texts = [], [], []
+        self.scalars, self.images = [], []
         self.flushed = self.closed = False
         Recorder.made.append(self)
 
@@ -39,9 +39,6 @@ class Recorder:
     def add_image(self, tag: str, pixels: np.ndarray, step: int, dataformats: str) -> None:
         assert dataformats == "HWC" and pixels.dtype == np.uint8
         self.images.append((tag, pixels, step))
-
-    def add_text(self, tag: str, text: str, step: int) -> None:
-        self.texts.append((tag, text, step))
 
     def flush(self) -> None:
         self.flushed = True
@@ -87,8 +84,6 @@ def test_a_run_tells_its_history_and_its_test_views(writers, capture, tmp_path):
     first, _, last = (pixels for _, pixels, _ in writer.images)
     assert first.shape[0] == 40 and first.shape[1] > 3 * 48 and (first[:, :48] == last[:, :48]).all()
     assert (first[:, 60:100] != last[:, 60:100]).any(), "the render changes, the photo does not"
-    ((_, text, _),) = writer.texts
-    assert "tensorboard: true" in text
 
 
 def test_a_resumed_run_takes_the_place_of_what_it_does_again(writers, capture, tmp_path, monkeypatch):
@@ -97,7 +92,7 @@ def test_a_resumed_run_takes_the_place_of_what_it_does_again(writers, capture, t
     resumed = run.resume(tmp_path / "run", watch=event_writers(config))
     first, second = writers
     assert {step for _, _, step in first.scalars} == {0, 7} and first.flushed
-    assert {step for _, _, step in second.scalars} == {7, 14} and second.purge_step == 6 and not second.texts
+    assert {step for _, _, step in second.scalars} == {7, 14} and second.purge_step == 6
     assert [entry.iteration for entry in resumed.history] == [0, 7, 14]
 
 

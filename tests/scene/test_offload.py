@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import assert_identical, tiny_config
-from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
-from turbogs_plugin.report import outputs
+from turbogs_plugin.export.renders import render_run
+from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.scene import Scene, load_scene, offload
 from turbogs_plugin.scene.offload import ABSENT, OffloadedErrorMaps, OffloadedPhotos, ViewWindow
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Step
@@ -96,10 +97,10 @@ def test_photos_stay_in_host_memory_when_a_run_is_looked_at(capture, tmp_path, m
     outcome = run.train(config, tmp_path / "run")
     to, moved = Photos.to, []
     monkeypatch.setattr(Photos, "to", lambda photos, device: moved.append(device) or to(photos, device))
-    table = outputs.evaluate_run(tmp_path / "run", "cpu")
+    table = evaluate_run(tmp_path / "run", "cpu")
     assert f"{outcome.history[-1].psnr:.4f}" in table
     assert moved == ([] if place == "host" else [CPU])
-    outputs.render_run(tmp_path / "run", "train", "cpu")
+    render_run(tmp_path / "run", "train", "cpu")
     assert len(moved) == (place == "device")
 
 

@@ -19,7 +19,7 @@ from turbogs_plugin.plan.caps import EXPECTED_GROWTH, growth_cap, growth_room
 from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.plan.pixels import TOLERANCE, pixel_budget_range, pixels_for_time, with_pixel_budget
 from turbogs_plugin.plan.time import IterationCost
-from turbogs_plugin.report.pages import write_report
+from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.train import calibration, run
 

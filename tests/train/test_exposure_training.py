@@ -11,8 +11,9 @@ from helpers.framework_runs import assert_identical, stop_after, tiny_capture, t
 from PIL import Image
 
 from turbogs_plugin.engine.rendering import render_image
-from turbogs_plugin.report.outputs import evaluate_run, render_run
-from turbogs_plugin.report.pages import write_report
+from turbogs_plugin.export.renders import render_run
+from turbogs_plugin.report.evaluation import evaluate_run
+from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from turbogs_plugin.train.evaluate import align_colors, compare, evaluate, render_view

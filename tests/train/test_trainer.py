@@ -26,7 +26,7 @@ from turbogs_plugin.config.yaml_text import parse_yaml
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import spatial_order
-from turbogs_plugin.report.pages import write_report
+from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.train import run

@@ -13,7 +13,7 @@ from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.report.pages import write_report
+from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.train import run, start, wall
 from turbogs_plugin.train import session as sessions
 from turbogs_plugin.train.wall import WallClock, WallRecord, process_age
@@ -149,10 +149,10 @@ def test_a_resumed_run_adds_its_processes_and_a_killed_one_is_not_forgotten(capt
 def test_the_report_takes_the_last_evaluation(capture, tmp_path, monkeypatch):
     """Views are rendered for its pictures alone; a process that did not evaluate the model does it for the report."""
     rendered = []
-    from turbogs_plugin.report import pages
+    from turbogs_plugin.report import run_report
 
-    evaluate = pages.evaluate
-    monkeypatch.setattr(pages, "evaluate", lambda *given, **named: rendered.append(1) or evaluate(*given, **named))
+    evaluate = run_report.evaluate
+    monkeypatch.setattr(run_report, "evaluate", lambda *given, **named: rendered.append(1) or evaluate(*given, **named))
     session = run.train(tiny_config(capture, "train.iterations=2"), tmp_path / "run", write_report)
     page = session.folder.report.read_text()
     assert not rendered and f"{session.history[-1].psnr:.2f}" in page

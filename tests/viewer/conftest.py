@@ -1,6 +1,8 @@
 """A training of a few iterations, and what a viewer shows of it."""
 
 import copy
+import threading
+from contextlib import closing, contextmanager
 
 import pytest
 from helpers.framework_runs import tiny_capture, tiny_config
@@ -8,7 +10,7 @@ from helpers.framework_runs import tiny_capture, tiny_config
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.run import new_loop
-from turbogs_plugin.viewer.subject import CaptureViews, Subject
+from turbogs_plugin.viewer.model_state import CaptureViews, ModelState
 
 
 @pytest.fixture(scope="session")
@@ -36,14 +38,43 @@ def new_training(capture, scene):
 
 @pytest.fixture(scope="session")
 def untouched(new_training, scene):
-    """Not to be changed: `subject` is a copy."""
+    """Not to be changed: `state` is a copy."""
     trainer = new_training().trainer
     trainer.initialise_maps()
     views = CaptureViews(trainer.views, scene.test)
-    return Subject(trainer.gaussians, trainer.sh_degree, capture=views, maps=trainer.maps, step=trainer.now)
+    return ModelState(trainer.gaussians, trainer.sh_degree, capture=views, maps=trainer.maps, step=trainer.now)
 
 
 @pytest.fixture
-def subject(untouched):
+def state(untouched):
     """A model after its maps were made, with its capture."""
     return copy.deepcopy(untouched)
+
+
+@pytest.fixture
+def shown():
+    """Shows a model on a page, from a thread of its own, while entered."""
+    pytest.importorskip("viser")
+    from turbogs_plugin.viewer.server import Page
+    from turbogs_plugin.viewer.show import server_of
+
+    @contextmanager
+    def shown(state: ModelState):
+        over = threading.Event()
+        with closing(Page("127.0.0.1", 0)) as page:
+            draw_due = server_of(state, "a model", page)
+
+            def serve() -> None:
+                while not over.is_set():
+                    if not draw_due():
+                        page.controls.wait(0.05)
+
+            thread = threading.Thread(target=serve)
+            thread.start()
+            try:
+                yield page
+            finally:
+                over.set()
+                thread.join()
+
+    return shown

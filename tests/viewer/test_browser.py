@@ -1,22 +1,17 @@
-"""The page in a real browser: frames arrive as they were drawn, pictures switch, a training is paused and goes on."""
+"""The page in a real browser: frames arrive as they were drawn, and pictures switch."""
 
 import dataclasses
 import io
 import shutil
-import threading
 import time
 
 import numpy as np
 import pytest
-from helpers.framework_runs import assert_identical
 from PIL import Image
 
-from turbogs_plugin.viewer.commands import Shown, show
-from turbogs_plugin.viewer.controls import Controls
-from turbogs_plugin.viewer.eye import Eye
-from turbogs_plugin.viewer.live import LiveViewer
-from turbogs_plugin.viewer.page import Page
+from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.pictures import Picture, Request, draw
+from turbogs_plugin.viewer.server import Page
 
 pytest.importorskip("viser")
 playwright = pytest.importorskip("playwright.sync_api")
@@ -74,19 +69,14 @@ class Tab:
         self.tab.get_by_role("button", name=name, exact=True).click()
 
 
-def test_frames_arrive_as_they_were_drawn_and_pictures_switch(browser, subject):
-    over, page = threading.Event(), Page("127.0.0.1", 0)
-    thread = threading.Thread(target=show, args=(Shown(subject, "a model"), page, over.is_set))
-    thread.start()
-    try:
+def test_frames_arrive_as_they_were_drawn_and_pictures_switch(browser, shown, state):
+    with shown(state) as page:
         tab = Tab(browser, page)
-        tab.tab.get_by_text("What you see.").wait_for(state="attached", timeout=1000 * PATIENCE)
-        assert tab.tab.get_by_text("Pause the training").count() == 0  # there is none
 
         def seen_from(view: int):
-            eye = Eye.of_view(subject.capture.train.cameras, view)
+            eye = ViewerCamera.of_view(state.capture.train.cameras, view)
             return lambda width, height: draw(
-                subject, Request(Picture.RENDER, dataclasses.replace(eye, width=width, height=height))
+                state, Request(Picture.RENDER, dataclasses.replace(eye, width=width, height=height))
             )
 
         renders = [tab.comes_to_show(seen_from(0))]
@@ -98,40 +88,4 @@ def test_frames_arrive_as_they_were_drawn_and_pictures_switch(browser, subject):
         for picture in (Picture.DEPTH, Picture.COMPARE, Picture.ERRORS, Picture.RENDER):
             tab.choose(picture)
             # A colour of a scale may jump with the last digit of a pose: so by the pose that the browser told.
-            tab.comes_to_show(lambda *size, picture=picture: draw(subject, Request(picture, page.screens()[0].eye, 6)))
-    finally:
-        over.set()
-        thread.join()
-        page.close()
-
-
-def test_a_training_is_paused_stepped_and_goes_on(browser, new_training, scene):
-    alone = new_training()
-    alone.run()
-    loop, page = new_training(), Page("127.0.0.1", 0, Controls())
-    loop.listeners.append(LiveViewer(page).attach(loop.trainer, scene.test))
-    page.controls.pause()
-    page.refresh_controls()
-    tab = Tab(browser, page)
-    thread = threading.Thread(target=loop.run)
-    thread.start()
-    try:
-        tab.tab.get_by_text("paused").wait_for(timeout=1000 * PATIENCE)
-        tab.tab.get_by_text("Pause the training").wait_for(state="attached", timeout=1000 * PATIENCE)
-        assert loop.trainer.iteration == 1
-        for iteration in (2, 3):
-            tab.press("One step")
-            tab.tab.get_by_text(f"iteration {iteration} of {loop.trainer.iterations} (paused)").wait_for(
-                timeout=1000 * PATIENCE
-            )
-            assert loop.trainer.iteration == iteration
-        tab.choose(Picture.SAMPLES)
-        tab.tab.get_by_text("views in this iteration").wait_for(timeout=1000 * PATIENCE)
-        tab.press("Go on")
-        thread.join(PATIENCE)
-        assert loop.finished
-    finally:
-        loop.stop()
-        thread.join()
-        page.close()
-    assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())
+            tab.comes_to_show(lambda *size, picture=picture: draw(state, Request(picture, page.screens()[0].camera, 6)))

@@ -6,13 +6,13 @@ import torch
 
 from turbogs_plugin.types import Gaussians
 from turbogs_plugin.viewer import frames as module
-from turbogs_plugin.viewer.eye import Eye
-from turbogs_plugin.viewer.frames import FEWEST_PIXELS, REST_SECONDS, SHARE, Frames, Pace, Screen
+from turbogs_plugin.viewer.camera import ViewerCamera
+from turbogs_plugin.viewer.frames import FEWEST_PIXELS, REST_SECONDS, SHARE, Frames, Screen
+from turbogs_plugin.viewer.model_state import ModelState
 from turbogs_plugin.viewer.pictures import Picture
-from turbogs_plugin.viewer.subject import Subject
 
-EYE = Eye((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 1.0, 640, 480)
-NOTHING = Subject(Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (), (1, 3), (0, 3)))), 0)
+EYE = ViewerCamera((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 1.0, 640, 480)
+NOTHING = ModelState(Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (), (1, 3), (0, 3)))), 0)
 
 
 class Desk:
@@ -33,16 +33,15 @@ class Desk:
         self.per_pixel = per_pixel
         monkeypatch.setattr(module, "draw", self._draw)
 
-    def _draw(self, subject: Subject, request) -> np.ndarray:
-        self.now += self.per_pixel * request.eye.width * request.eye.height
-        return np.zeros((request.eye.height, request.eye.width, 3), dtype=np.uint8)
+    def _draw(self, state: ModelState, request) -> np.ndarray:
+        self.now += self.per_pixel * request.camera.width * request.camera.height
+        return np.zeros((request.camera.height, request.camera.width, 3), dtype=np.uint8)
 
     def _take(self, at: int, pixels: np.ndarray, lossless: bool) -> None:
         self.sent.append((at, pixels.shape[1], lossless))
-        self.screens[at].busy = False
 
     def look(self, x: float, at: int = 0) -> None:
-        self.screens[at].look(Eye((x, 0.0, 0.0), EYE.wxyz, EYE.fov, EYE.width, EYE.height), self.now)
+        self.screens[at].look(ViewerCamera((x, 0.0, 0.0), EYE.wxyz, EYE.fov, EYE.width, EYE.height), self.now)
 
     def serve(self, version: int = 0, running: bool = False) -> bool:
         return self.frames.serve(lambda: NOTHING, version, running)
@@ -51,8 +50,8 @@ class Desk:
         self.now += seconds
 
 
-def refuse() -> Subject:
-    raise AssertionError("a subject was asked for, and nobody looks")
+def refuse() -> ModelState:
+    raise AssertionError("a state was asked for, and nobody looks")
 
 
 def test_nobody_looks_and_nothing_is_drawn(monkeypatch):
@@ -91,15 +90,6 @@ def test_whatever_is_new_is_drawn_again(monkeypatch):
     desk.wait(1.0)
     desk.wish = (Picture.DEPTH, 3)
     assert desk.serve(version=1) and all(lossless for *_, lossless in desk.sent)
-
-
-def test_a_page_is_not_served_while_its_last_frame_is_encoded(monkeypatch):
-    desk = Desk(monkeypatch)
-    desk.look(0.0)
-    desk.screens[0].busy = True
-    assert not desk.serve()
-    desk.screens[0].busy = False
-    assert desk.serve()
 
 
 def test_pages_are_served_in_turn(monkeypatch):
@@ -144,13 +134,16 @@ def test_without_a_training_moving_frames_keep_pace_and_the_one_at_rest_is_whole
     assert desk.serve() and desk.sent[-1] == (0, EYE.width, True)
 
 
-def test_sizes_come_in_steps():
-    pace = Pace(None)
+def test_sizes_come_in_steps(monkeypatch):
     widths = set()
     for step in range(100):
-        pace.spent(Picture.RENDER, 0.0, 0.1 + 0.004 * step, 100_000)
-        widths.add(pace.sized(Picture.RENDER, EYE, moving=True).width)
-    assert len(widths) <= 5
+        desk = Desk(monkeypatch, per_pixel=1e-6 + 4e-8 * step)
+        for x in range(2):
+            desk.look(float(x))
+            desk.serve()
+            desk.wait(0.1)
+        widths.add(desk.sent[-1][1])
+    assert 1 < len(widths) <= 5
 
 
 @pytest.mark.parametrize(("running", "most"), [(True, 15), (False, 30)])
@@ -167,13 +160,12 @@ def test_a_training_is_asked_for_fewer_frames(monkeypatch, running, most):
 def test_a_full_device_ends_no_training(monkeypatch):
     desk = Desk(monkeypatch)
 
-    def full(subject, request):
+    def full(state, request):
         raise torch.cuda.OutOfMemoryError
 
     monkeypatch.setattr(module, "draw", full)
     desk.look(0.0)
-    assert desk.serve() and desk.sent == [] and "memory" in desk.screens[0].failed
-    assert not desk.screens[0].busy
+    assert desk.serve() and desk.sent == []
 
 
 def test_waiting_for_the_training_is_no_cost_of_a_frame(monkeypatch):
@@ -181,10 +173,10 @@ def test_waiting_for_the_training_is_no_cost_of_a_frame(monkeypatch):
     desk = Desk(monkeypatch, per_pixel=1e-6)
     desk.look(0.0)
 
-    def drained() -> Subject:
+    def drained() -> ModelState:
         desk.wait(1.0)
         return NOTHING
 
     assert desk.frames.serve(drained, 0, True)
     width = desk.sent[-1][1]
-    assert desk.frames.paces[True].next_at == pytest.approx(101.0 + 1e-6 * width * width * 3 / 4 / SHARE)
+    assert desk.frames.next_at == pytest.approx(101.0 + 1e-6 * width * width * 3 / 4 / SHARE)

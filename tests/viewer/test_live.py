@@ -2,22 +2,19 @@
 
 import threading
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from helpers.framework_runs import assert_identical
 
-from turbogs_plugin.train.clock import TrainingClock
 from turbogs_plugin.train.loop import Listener
 from turbogs_plugin.viewer import frames
 from turbogs_plugin.viewer import live as module
-from turbogs_plugin.viewer.controls import Controls
-from turbogs_plugin.viewer.eye import Eye
-from turbogs_plugin.viewer.frames import Frames, Screen
+from turbogs_plugin.viewer.camera import ViewerCamera
+from turbogs_plugin.viewer.frames import Screen
 from turbogs_plugin.viewer.live import LiveViewer
 from turbogs_plugin.viewer.pictures import Picture
+from turbogs_plugin.viewer.server import Controls
 
 
 class PretendedPage:
@@ -37,8 +34,6 @@ class PretendedPage:
         return bool(self._screens)
 
     def screens(self) -> list[Screen]:
-        for screen in self._screens:
-            screen.busy = False
         return self._screens
 
     def wish(self) -> tuple[Picture, int]:
@@ -46,7 +41,7 @@ class PretendedPage:
 
     def show_capture(self, capture) -> None:
         for screen in self._screens:
-            screen.eye = Eye.of_view(capture.train.cameras, 1)
+            screen.camera = ViewerCamera.of_view(capture.train.cameras, 1)
 
     def say(self, text: str) -> None:
         self.said.append(text)
@@ -71,13 +66,13 @@ class At(Listener):
 
 
 @pytest.fixture
-def watched(new_training, scene):
-    """Makes (page, viewer, training)."""
+def watched(new_training, scene, monkeypatch):
+    """Makes (page, viewer, training). Every frame that is due is drawn, whatever it takes."""
+    monkeypatch.setattr(frames, "SHARE", 1e9)
 
     def watched(*overrides: str, looking: bool = True):
         page, loop = PretendedPage(looking), new_training(*overrides)
         live = LiveViewer(page).attach(loop.trainer, scene.test)
-        live.frames = Frames(page.screens, page.wish, share=None)  # every frame that is due, whatever it takes
         loop.listeners.append(live)
         return page, live, loop
 
@@ -93,14 +88,14 @@ def test_a_watched_training_ends_as_an_unwatched_one(new_training, watched, monk
     alone.run()
     page, _, loop = watched(*overrides)
     loop.run()
-    assert len(page.frames) >= loop.trainer.iteration > 10 and len({frame.tobytes() for frame in page.frames}) > 8
+    assert len(page.frames) >= loop.trainer.iteration > 10 and len({frame.tobytes() for frame in page.frames}) > 6
     assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())
     assert any("Gaussians" in text and "iteration" in text for text in page.said)
 
 
 def test_nothing_is_drawn_or_kept_while_nobody_looks(watched, monkeypatch):
     page, live, loop = watched(looking=False)
-    monkeypatch.setattr(LiveViewer, "_subject", lambda self: pytest.fail("a subject was made for nobody"))
+    monkeypatch.setattr(LiveViewer, "_state", lambda *_: pytest.fail("a state was made for nobody"))
     loop.run()
     assert page.frames == [] and page.said == []
     assert live._samples is None and live._change is None
@@ -109,12 +104,12 @@ def test_nothing_is_drawn_or_kept_while_nobody_looks(watched, monkeypatch):
 def test_what_an_iteration_did_is_shown(watched):
     _, live, loop = watched()
     changes = []
-    loop.listeners.append(At(5, lambda: changes.append(live._subject())))
+    loop.listeners.append(At(5, lambda: changes.append(live._state(loop.trainer))))
     loop.run()
-    (subject,) = changes
-    assert subject.samples is not None and len(subject.samples) > 0
-    assert len(subject.change.added) == len(subject.gaussians)
-    assert int(subject.change.added.sum()) >= subject.change.num_split > 0
+    (state,) = changes
+    assert state.samples is not None and len(state.samples) > 0
+    assert len(state.change.update.fresh) == len(state.gaussians)
+    assert int(state.change.update.fresh.sum()) >= state.change.update.num_split > 0
 
 
 def test_pause_step_and_go_on(new_training, watched, monkeypatch):
@@ -135,11 +130,11 @@ def test_pause_step_and_go_on(new_training, watched, monkeypatch):
 
     def click() -> None:
         """As a page's thread would."""
-        for iteration, press in ((4, page.controls.step), (5, page.controls.step), (6, page.controls.resume)):
+        for iteration, press in ((4, (True, 1)), (5, (True, 1)), (6, (False,))):
             until(lambda iteration=iteration: iteration in waited)
-            press()
+            page.controls.set_paused(*press)
 
-    loop.listeners.insert(0, At(4, page.controls.pause))
+    loop.listeners.insert(0, At(4, lambda: page.controls.set_paused(True)))
     thread = threading.Thread(target=click)
     thread.start()
     loop.run()
@@ -152,22 +147,9 @@ def test_pause_step_and_go_on(new_training, watched, monkeypatch):
     assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())
 
 
-def test_the_clock_does_not_count_what_is_no_training(monkeypatch):
-    now = [0.0]
-    monkeypatch.setattr("turbogs_plugin.train.clock.time", SimpleNamespace(perf_counter=lambda: now[0]))
-    clock = TrainingClock(torch.device("cpu"), seconds=5.0)
-    with clock:
-        now[0] += 1.0
-        with clock.stopped():
-            now[0] += 100.0
-        now[0] += 2.0
-        assert clock.now() == 8.0
-    assert clock.seconds == 8.0
-
-
 def test_a_paused_training_can_be_stopped(watched, monkeypatch):
     page, _, loop = watched()
-    loop.listeners.insert(0, At(3, page.controls.pause))
+    loop.listeners.insert(0, At(3, lambda: page.controls.set_paused(True)))
     monkeypatch.setattr(page.controls, "wait", lambda seconds: loop.stop())
     loop.run()
     assert loop.trainer.iteration == 3 and loop.stopped
@@ -178,7 +160,7 @@ def test_a_paused_training_goes_on_when_nobody_looks_any_more(watched, monkeypat
     page, _, loop = watched()
 
     def pause_and_leave() -> None:
-        page.controls.pause()
+        page.controls.set_paused(True)
         page._screens.clear()
 
     loop.listeners.insert(0, At(3, pause_and_leave))
@@ -211,14 +193,8 @@ def until(reached, seconds: float = 60.0) -> None:
 def test_steps_are_counted():
     controls = Controls()
     assert not controls.paused and not controls.take_step()
-    controls.step()
-    controls.step()
+    controls.set_paused(True, 1)
+    controls.set_paused(True, 1)
     assert controls.paused and controls.take_step() and controls.take_step() and not controls.take_step()
-    controls.resume()
+    controls.set_paused(False)
     assert not controls.paused
-
-
-def test_an_evaluation_is_told(watched):
-    _, live, loop = watched()
-    live.evaluated(loop, SimpleNamespace(psnr=21.5))
-    assert "21.50 dB" in live._status(True, time.perf_counter())

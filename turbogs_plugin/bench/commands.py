@@ -28,13 +28,12 @@ from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.engine.cuda.library import LIBRARY_VARIABLE, require
 from turbogs_plugin.errors import InputError, exit_code
 from turbogs_plugin.files import require_writable, write_text_atomically
-from turbogs_plugin.report.machine import missing_bytecode
-from turbogs_plugin.report.provenance import provenance
+from turbogs_plugin.report.provenance import missing_bytecode, provenance
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS
 from turbogs_plugin.study.cell import scene_on
 from turbogs_plugin.train.start import open_scene
-from turbogs_plugin.viewer.page import require_viser
+from turbogs_plugin.viewer.server import require_server
 
 AGAIN = "this build, in a process of its own"
 """The name of this build among the others, which compare with it and not with the first measurement: in the process
@@ -109,7 +108,7 @@ def run_wall(arguments: Sequence[str], repeats: int, device: torch.device, out: 
 
 def run_viewer(config: Config, repeats: int, device: torch.device, out: Path | None) -> None:
     """Times trainings with and without a viewer; prints them side by side, and writes the JSON if there is a file."""
-    require_viser()
+    require_server("127.0.0.1", 0)
     measured = bench_viewer(config, open_scene(config), device, repeats)
     print("\n".join(viewer_lines(measured)))
     _keep(_report("viewer", measured, device), [f"json  {out}"], out)

@@ -18,7 +18,7 @@ from turbogs_plugin.bench.clocks import measure
 from turbogs_plugin.bench.statistics import write_record
 from turbogs_plugin.engine.reference import lm_solvers
 from turbogs_plugin.files import write_atomically, write_text_atomically
-from turbogs_plugin.report.plots import STYLE
+from turbogs_plugin.report.curves import STYLE
 from turbogs_plugin.report.tables import table
 
 Problem = tuple[Tensor, Tensor, Tensor, Tensor]

@@ -15,7 +15,7 @@ from torch import Tensor
 from turbogs_plugin.bench.models import ring_cameras, surface_gaussians, tile_samples
 from turbogs_plugin.engine.rendering import rasterize, rasterize_reference
 from turbogs_plugin.files import write_text_atomically
-from turbogs_plugin.report.machine import hardware, software
+from turbogs_plugin.report.provenance import hardware, software
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples
 

@@ -22,10 +22,9 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.run import new_loop
-from turbogs_plugin.viewer.controls import Controls
-from turbogs_plugin.viewer.eye import Eye
+from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.live import LiveViewer
-from turbogs_plugin.viewer.page import Page
+from turbogs_plugin.viewer.server import Page
 
 WAYS = ("without", "nobody looks", "client")
 """Of each repeat, in this order."""
@@ -135,12 +134,12 @@ def _train(way: str, config: Config, scene: Scene, device: torch.device) -> View
     loop.listeners = [begin]
     with ExitStack() as stack:
         if way != "without":
-            page = Page("127.0.0.1", 0, Controls())
+            page = Page("127.0.0.1", 0, training=True)
             stack.callback(page.close)
             test = place_views(scene.test, device, config.train.photos_place)
             loop.listeners.insert(0, LiveViewer(page).attach(loop.trainer, test))
         if way == "client":
-            client = _start_client(page, Eye.of_view(loop.trainer.views.cameras, 0))
+            client = _start_client(page, ViewerCamera.of_view(loop.trainer.views.cameras, 0))
         loop.run()
     iterations, seconds = loop.trainer.iteration - begin.iteration, loop.clock.seconds - begin.seconds
     run = ViewerRun(way, iterations, seconds, gaussians=len(loop.trainer.gaussians))
@@ -161,10 +160,10 @@ class _Begin(Listener):
         self.iteration, self.seconds = loop.trainer.iteration, loop.clock.seconds
 
 
-def _start_client(page: Page, eye: Eye) -> subprocess.Popen:
+def _start_client(page: Page, eye: ViewerCamera) -> subprocess.Popen:
     """A scripted client in a process of its own, connected."""
     numbers = json.dumps([eye.position, eye.wxyz, eye.fov, *SIZE])
-    command = [sys.executable, "-m", "turbogs_plugin.bench.viewer_client", f"http://127.0.0.1:{page.port}", numbers]
+    command = [sys.executable, "-m", "turbogs_plugin.bench.viewer_client", f"{page.url}", numbers]
     client = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path.cwd())
     ends = time.perf_counter() + PATIENCE
     while not page.watched:

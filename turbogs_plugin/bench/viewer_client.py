@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from turbogs_plugin.viewer.eye import Eye
+from turbogs_plugin.viewer.camera import ViewerCamera
 
 MOVES_A_SECOND = 30.0
 TURN = 0.05
@@ -69,7 +69,7 @@ class ScriptedClient:
     def __exit__(self, *error: object) -> None:
         self._socket.close()
 
-    def look(self, eye: Eye) -> None:
+    def look(self, eye: ViewerCamera) -> None:
         """Tell where this client's camera is."""
         message = {"type": "ViewerCameraMessage", "wxyz": eye.wxyz, "position": eye.position, "fov": eye.fov}
         message |= {"near": 0.01, "far": 1000.0, "image_height": eye.height, "image_width": eye.width}
@@ -95,7 +95,7 @@ class ScriptedClient:
                 yield Frame(time.perf_counter(), message["format"] == "png", message["rgb_data"])
 
 
-def turning(eye: Eye, seconds: float) -> Eye:
+def turning(eye: ViewerCamera, seconds: float) -> ViewerCamera:
     """The eye after so long on a small circle, once around in two seconds."""
     angle = math.pi * seconds
     x, y, z = eye.position
@@ -108,7 +108,7 @@ def main() -> None:
 
     url, numbers = sys.argv[1:]
     position, wxyz, fov, width, height = json.loads(numbers)
-    eye = Eye(tuple(position), tuple(wxyz), fov, width, height)
+    eye = ViewerCamera(tuple(position), tuple(wxyz), fov, width, height)
     frames: list[Frame] = []
     with ScriptedClient(url) as client:
         began = time.perf_counter()

@@ -1,11 +1,11 @@
-"""`turbogs view`, `eval`, `render` and `export`: what is done with a model, of a run or trained anywhere."""
+"""`turbogs view`, `eval`, `render` and `export`: commands on a model, of a run or trained anywhere."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import arg
+from tyro.conf import FlagCreatePairsOff, arg
 
 from turbogs_plugin.commands.options import LOCAL, NO_SCENE, PORT, Count, Device, Given, Overrides, RunOrModel
 from turbogs_plugin.errors import InputError
@@ -30,9 +30,10 @@ def view(
         host: where it listens; 0.0.0.0 lets others on the network look.
         device: where to render.
     """
-    from turbogs_plugin.viewer import commands
+    from turbogs_plugin.viewer import show
 
-    return commands.view(run, port, host, device, given.settings(overrides))
+    show.view(run, port, host, device, given.settings(overrides))
+    return 0
 
 
 def evaluate(run: RunOrModel, overrides: Overrides = (), /, *, device: Device = "auto", given: Given = NO_SCENE) -> int:
@@ -43,7 +44,7 @@ def evaluate(run: RunOrModel, overrides: Overrides = (), /, *, device: Device = 
         overrides: with --scene, e.g. scene.test_every=10.
         device: where to render.
     """
-    from turbogs_plugin.report.outputs import evaluate_run
+    from turbogs_plugin.report.evaluation import evaluate_run
 
     print(evaluate_run(run, device, given.settings(overrides)))
     return 0
@@ -56,9 +57,8 @@ def render(
     *,
     split: Literal["test", "train"] = "test",
     depth: bool = False,
-    out: Annotated[Path | None, arg(metavar="FOLDER")] = None,
+    out: Annotated[Path | None, arg(metavar="FOLDER|FILE")] = None,
     path: Annotated[str | None, arg(metavar="orbit|views|FILE")] = None,
-    video: Annotated[Path | None, arg(metavar="FILE")] = None,
     seconds: Annotated[float | None, arg(metavar="SECONDS")] = None,
     device: Device = "auto",
     given: Given = NO_SCENE,
@@ -71,25 +71,25 @@ def render(
         split: which cameras.
         depth: also write depth images: .npy (float32, along the camera's axis, in the capture's own units; 0 where
             nothing was hit) and .png (near is bright).
-        out: folder for the pictures; renders in the run's folder where absent.
-        path: of a film: orbit, about what the capture shows, also where absent; views, through its training cameras;
-            or a file of cameras in the layout of transforms.json.
-        video: write a film of 60 frames a second to this new file (.mp4) in the place of pictures.
+        out: folder for the pictures; renders in the run's folder where absent. With --path the new file of the film
+            (.mp4).
+        path: write a film of 60 frames a second along a path: orbit, about what the capture shows; views, through its
+            training cameras; or a file of cameras in the layout of transforms.json.
         seconds: of the film; 10 where absent.
         device: where to render.
     """
-    if video is not None:
-        from turbogs_plugin.export.commands import film_run
+    if path is not None:
+        from turbogs_plugin.export.film import film_run
 
-        if depth or out is not None or split != "test":
-            raise InputError("--video writes a film: it takes --path and --seconds, not --split, --depth or --out")
+        if depth or split != "test" or out is None:
+            raise InputError("--path writes a film: it takes --out FILE.mp4 and --seconds, not --split or --depth")
         length = 10.0 if seconds is None else seconds
-        print(f"film   {film_run(run, path or 'orbit', video, length, device, given.settings(overrides))}")
+        print(f"film   {film_run(run, path, out, length, device, given.settings(overrides))}")
         return 0
-    if path is not None or seconds is not None:
-        raise InputError("--path and --seconds are those of a film: give --video FILE, too")
+    if seconds is not None:
+        raise InputError("--seconds is the length of a film: give --path and --out FILE.mp4, too")
 
-    from turbogs_plugin.report.outputs import render_run
+    from turbogs_plugin.export.renders import render_run
 
     folders = render_run(run, split, device, depth, given.settings(overrides), out)
     for name, folder in zip(("renders", "depths"), folders, strict=False):
@@ -104,25 +104,33 @@ def export(
     *,
     format: Annotated[str, arg(metavar="ply|pt|compressed-ply|splat|spz|html")] = "ply",
     out: Path | None = None,
-    drop_bands: Annotated[float | None, arg(metavar="SHARE")] = None,
     max_gaussians: Count = None,
+    cameras: FlagCreatePairsOff[bool] = False,
     given: Given = NO_SCENE,
 ) -> int:
     """Write the newest model of a run, or a model trained anywhere, for other programs, in the capture's own
-    coordinates; read it again, and say what was lost. Or write all of a run on one page.
+    coordinates; read it again, and say what was lost. Or write a capture with refined cameras for other trainers.
 
     Args:
-        run: folder of the run; or with --scene the file of a model.
+        run: folder of the run; or with --scene the file of a model; or with --cameras the folder of a COLMAP capture.
         overrides: with --scene, as in eval.
         format: ply: as the original 3DGS writes it, which viewers read. pt: a checkpoint of gsplat's simple_trainer,
             which needs --no-normalize-world-space to take it. compressed-ply, splat, spz: smaller, with some loss.
-            html: curves, tables, test views and the model in a viewer, in one file below 32 MB.
-        out: new file; model.ply, model.pt, ..., or report.html in the run's folder where absent.
-        drop_bands: leave out the highest bands of spherical harmonics, as many as together have at most this share of
-            the colours' energy, e.g. 1e-4.
-        max_gaussians: at most so many, those that add most to the training views.
+            html: a page with the model to turn in a browser, without a network.
+        out: new file; model.ply, model.pt, ..., or model.html in the run's folder where absent.
+        max_gaussians: largest number of Gaussians; those are kept that add most to the training views.
+        cameras: give each photo of a capture a refined camera of its own, and write a capture to train on, with
+            sparse/0 and links to the photos, into the new folder --out. Trainers must read the principal point of each
+            camera: gsplat's does, LiteGS and 3DGS's own do not.
     """
-    from turbogs_plugin.export.commands import export_run
+    if cameras:
+        from turbogs_plugin.export.refined_capture import write_refined
 
-    print(f"model  {export_run(run, format, out, drop_bands, max_gaussians, given.settings(overrides)).text()}")
+        if out is None or overrides or max_gaussians is not None or format != "ply" or given != NO_SCENE:
+            raise InputError("--cameras writes a capture: it takes SCENE and --out FOLDER, and nothing else")
+        print(write_refined(run, out))
+        return 0
+    from turbogs_plugin.export.model_export import export_run
+
+    print(f"model  {export_run(run, format, out, max_gaussians, given.settings(overrides)).text()}")
     return 0

@@ -79,8 +79,7 @@ def train(
         raise InputError(VIEWER_ON_ONE)
     gc.disable()  # imports make a million objects and nothing to collect
     from turbogs_plugin.distributed.processes import joined, launched, restarted, start
-    from turbogs_plugin.report.pages import write_report
-    from turbogs_plugin.report.plot_process import PlotProcess
+    from turbogs_plugin.report.run_report import write_report
     from turbogs_plugin.report.tensorboard import event_writers
     from turbogs_plugin.train import run
     from turbogs_plugin.train.finished import finished_text
@@ -104,12 +103,10 @@ def train(
         if viewer is not None:
             if ranks.count > 1:
                 raise InputError(VIEWER_ON_ONE)  # started by torchrun
-            from turbogs_plugin.viewer.commands import attached
+            from turbogs_plugin.viewer.live import attached
 
             live = pages.enter_context(attached(viewer, viewer_host))
             watch.append(live.watch)
-        if report and ranks.first:
-            page = partial(write_report, process=pages.enter_context(PlotProcess()))
         begin = partial(run.resume, resume) if resume else partial(run.train, settings, out)
         session = begin(page, clock, ranks, watch)
         code = _tell(session, report) if ranks.first else 128 + session.signal if session.signal else 0

@@ -10,8 +10,6 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine import engine_of
-from turbogs_plugin.engine.reference.intersection import intersect_tiles
-from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
 from turbogs_plugin.engine.reference.raster import rasterize_reference
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, RenderOptions
 from turbogs_plugin.tiles import dense_pixels
@@ -26,7 +24,6 @@ __all__ = [
     "rasterize",
     "rasterize_reference",
     "render_image",
-    "splats_per_tile",
 ]
 
 
@@ -75,19 +72,3 @@ def render_image(gaussians: Gaussians, cameras: Cameras, view_id: int = 0, **opt
 
     depths = None if rendered.depths is None else image(rendered.depths)
     return RenderedImage(image(rendered.colors), image(rendered.alphas), depths)
-
-
-@torch.no_grad()
-def splats_per_tile(
-    gaussians: Gaussians, cameras: Cameras, view_id: int = 0, settings: RasterSettings = DEFAULT_SETTINGS
-) -> Tensor:
-    """[rows, columns] int64: how many splats reach each tile of a view, which is what its rendering costs.
-
-    Counted in torch on any device, by the definition of every engine's lists.
-    """
-    one = cameras.select([view_id])
-    samples = dense_samples(one)
-    rows = drawable_rows(gaussians, one, settings)
-    splats = project_rows(rows, rows.take(gaussians), one, 0, settings)
-    columns, lines = samples.grid.shapes[0].tolist()
-    return intersect_tiles(rows, splats, samples, settings).tile_counts.view(lines, columns)

@@ -1,1 +1,1 @@
-"""What a run hands over: its model in the formats of other programs, one page with everything in it, and films."""
+"""Results of a run to hand over: models in other formats, a page to turn a model on, renders, films, refined captures."""

@@ -1,4 +1,4 @@
-"""Paths of cameras for films: an orbit about what the capture shows, a way through its cameras, or a file's cameras."""
+"""Paths of cameras for films: an orbit about the capture's subject, a way through its cameras, or a file's cameras."""
 
 from __future__ import annotations
 
@@ -9,24 +9,23 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from turbogs_plugin.engine.reference.projection import rotation_matrices
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.capture import LARGEST_SIDE
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.poses import camera_centers, evenly, look_at, quaternions
+from turbogs_plugin.scene.poses import camera_centers, evenly, look_at
 from turbogs_plugin.scene.transforms import number_of, opengl_viewmat, pinhole, read_frames
 from turbogs_plugin.types import Cameras
 
 MOST_KEYS = 24
-"""Cameras of a capture that a path goes through, evenly spread: more would make it jitter."""
+"""Largest number of a capture's cameras that a path goes through, evenly spread: more would make it jitter."""
 SWING = math.pi
-"""Cameras that leave a gap of more than this angle about what they look at do not surround it: an orbit swings."""
+"""Largest gap in radians between cameras that surround what they look at; beyond it an orbit swings."""
 WIDEST_FILM = 1920
 """Pixels of the longer side of a film from the capture's cameras; a file's cameras have their own size."""
 
 
 def focus_and_up(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """[3] the point nearest to all lines of sight (least squares), and [3] the mean upward direction, a unit vector.
+    """The point nearest to all lines of sight (least squares), [3], and the mean upward direction, [3], a unit vector.
 
     Where the lines are parallel, or meet behind the cameras, the point is one unit in front of their mean.
     """
@@ -110,8 +109,8 @@ def from_file(path: Path, frame: Frame, frames: int) -> Cameras:
 
 
 def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: tuple[int, int], frames: int) -> Cameras:
-    """Cameras at even steps of a smooth way through others: centres on a Catmull-Rom spline (centripetal, so without
-    loops), rotations by slerp, intrinsics by lines.
+    """Cameras at even steps of a smooth way through others: centres on a cubic Hermite spline whose tangents are
+    central differences, rotations by slerp, intrinsics by lines.
 
     Args:
         viewmats: [C, 4, 4] float64, world to camera.
@@ -119,71 +118,40 @@ def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: tuple[int, int], fr
         size: (width, height) of the film.
         frames: at least 1.
     """
-    centers, quats = camera_centers(viewmats), quaternions(viewmats[:, :3, :3])
-    if len(centers) == 1:
+    from scipy.interpolate import CubicHermiteSpline, interp1d
+    from scipy.spatial.transform import Rotation, Slerp
+
+    if len(viewmats) == 1:
         return _cameras(np.repeat(viewmats, frames, axis=0), np.repeat(Ks, frames, axis=0), size)
+    centers, rotations = camera_centers(viewmats), Rotation.from_matrix(viewmats[:, :3, :3])
     chords = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    turns = 2 * np.arccos(np.abs((quats[1:] * quats[:-1]).sum(axis=1)).clip(0, 1))
+    turns = (rotations[1:] * rotations[:-1].inv()).magnitude()
+    # Time in proportion to the way makes the speed even; where the cameras share a place, to the angle.
     lengths = chords / max(chords.mean(), 1e-12) + turns / max(turns.mean(), 1e-12) * (chords.mean() < 1e-9)
-    times = np.concatenate([[0.0], np.cumsum(np.maximum(lengths, 1e-3))])  # of the keys: even speed
+    times = np.concatenate([[0.0], np.cumsum(np.maximum(lengths, 1e-3))])  # [C]
     wanted = np.linspace(0.0, times[-1], frames)
-    left = np.searchsorted(times, wanted, side="right").clip(1, len(times) - 1) - 1
-    share = (wanted - times[left]) / (times[left + 1] - times[left])  # [F]
-    places = _catmull_rom(centers, left, share)
+    places = CubicHermiteSpline(times, centers, np.gradient(centers, times, axis=0))(wanted)  # [F, 3]
     made = np.tile(np.eye(4), (frames, 1, 1))
-    turned = _slerp(quats[left], quats[left + 1], share)
-    made[:, :3, :3] = rotation_matrices(torch.from_numpy(turned)).numpy()
+    made[:, :3, :3] = Slerp(times, rotations)(wanted).as_matrix()
     made[:, :3, 3] = -np.einsum("fij,fj->fi", made[:, :3, :3], places)
-    between = Ks[left] + share[:, None, None] * (Ks[left + 1] - Ks[left])
-    return _cameras(made, between, size)
-
-
-def _slerp(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """[F, 4] between unit quaternions [F, 4], on the shorter way."""
-    cosine = (first * second).sum(axis=1)
-    second = np.where(cosine[:, None] < 0, -second, second)
-    angle = np.arccos(np.abs(cosine).clip(0, 1))
-    small = angle < 1e-6
-    sine = np.where(small, 1.0, np.sin(angle))
-    a = np.where(small, 1 - share, np.sin((1 - share) * angle) / sine)
-    b = np.where(small, share, np.sin(share * angle) / sine)
-    mixed = a[:, None] * first + b[:, None] * second
-    return mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
-
-
-def _catmull_rom(points: np.ndarray, left: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """[F, 3] on the centripetal Catmull-Rom spline (Barry and Goldman 1988) through points [C, 3]: behind point `left`
-    [F], by `share` [F] of the way to the next. At both ends the last chord is repeated."""
-    ends = np.concatenate([[2 * points[0] - points[1]], points, [2 * points[-1] - points[-2]]])
-    p = [ends[left + place] for place in range(4)]
-    steps = [np.maximum(np.linalg.norm(p[i + 1] - p[i], axis=1) ** 0.5, 1e-9) for i in range(3)]
-    t = np.cumsum([np.zeros_like(share), *steps], axis=0)  # [4, F]
-    at = t[1] + share * (t[2] - t[1])
-
-    def mix(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        part = ((at - low) / (high - low))[:, None]
-        return a + part * (b - a)
-
-    q = [mix(p[i], p[i + 1], t[i], t[i + 1]) for i in range(3)]
-    r = [mix(q[i], q[i + 1], t[i], t[i + 2]) for i in range(2)]
-    return mix(r[0], r[1], t[1], t[2])
+    return _cameras(made, interp1d(times, Ks, axis=0)(wanted), size)
 
 
 def _common_lens(cameras: Cameras) -> tuple[np.ndarray, tuple[int, int]]:
-    """[3, 3] intrinsics with the picture's middle as principal point, and an even (width, height): the median camera's,
+    """Intrinsics [3, 3] with the picture's middle as principal point, and an even (width, height): the median camera's,
     reduced to `WIDEST_FILM`."""
     order = np.argsort(cameras.sizes.prod(axis=1), kind="stable")
     middle = int(order[len(order) // 2])
     width, height = cameras.sizes[middle].tolist()
     by = min(1.0, WIDEST_FILM / max(width, height))
-    size = tuple(max(2, 2 * int(by * side / 2)) for side in (width, height))
+    size = max(2, 2 * int(by * width / 2)), max(2, 2 * int(by * height / 2))
     K = cameras.Ks[middle].double().cpu().numpy() * by
     return np.array([[K[0, 0], 0, size[0] / 2], [0, K[1, 1], size[1] / 2], [0, 0, 1.0]]), size
 
 
 def _cameras(viewmats: np.ndarray, Ks: np.ndarray, size: tuple[int, int]) -> Cameras:
-    tensors = (torch.from_numpy(np.ascontiguousarray(value)).float() for value in (viewmats, Ks))
-    return Cameras(*tensors, np.tile(np.array(size, dtype=np.int64), (len(viewmats), 1)))
+    poses, lenses = (torch.from_numpy(np.ascontiguousarray(value)).float() for value in (viewmats, Ks))
+    return Cameras(poses, lenses, np.tile(np.array(size, dtype=np.int64), (len(viewmats), 1)))
 
 
 def _unit(vector: np.ndarray, otherwise: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a model loses on its way into a file: its error on test views before and after."""
+"""The loss of a model on its way into a file: its error on test views before and after."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Change:
 
     Args:
         before, after: means; `after` is NaN where no Gaussian is left.
-        views, of: how many were measured, of how many.
+        views, of: number of measured views, and of all test views.
         worst_view, worst_loss: name of the measured view that lost most, and how much it lost.
-        equal: whether every number of the model is as it was.
+        equal: whether every number of the model stayed.
     """
 
     before: float
@@ -53,58 +53,34 @@ def _lost(loss: float) -> str:
     return f"{loss:.3f} dB lost" if loss > 0 else f"{-loss:.3f} dB won"
 
 
-class Fidelity:
-    """Measures models on the same few test views.
+def measure_change(model: Gaussians, other: Gaussians, views: PosedImages, look: Look) -> Change:
+    """Compare a model with what became of it, on at most `MOST_VIEWS` views.
 
     Args:
-        gaussians: the model, on the device where all are rendered.
+        model: on the device that renders.
+        other: in the scene's frame, on any device.
         views: the test views, at least one, on any device. Masked pixels do not count.
-        look: how it is shown; without exposures, as a file of a model holds none.
-
-    Attributes:
-        view_ids: those that are measured.
-        before: mean PSNR in dB of the model.
+        look: how the models are shown; without exposures, as a file of a model holds none.
     """
+    other = other.map(lambda value: value.to(model.device))
+    view_ids = evenly(len(views), MOST_VIEWS)
+    before = [view_psnr(model, views, view, look) for view in view_ids]
+    counts = (len(view_ids), len(views))
+    if not len(other):
+        return Change(fmean(before), math.nan, *counts)
+    after = [view_psnr(other, views, view, look) for view in view_ids]
+    losses = [first - second for first, second in zip(before, after, strict=True)]
+    place = int(np.argmax(losses))
+    pairs = zip(model.items(), other.items(), strict=True)
+    equal = all(torch.equal(value, changed) for (_, value), (_, changed) in pairs)
+    return Change(fmean(before), fmean(after), *counts, views.names[view_ids[place]], losses[place], equal)
 
-    def __init__(self, gaussians: Gaussians, views: PosedImages, look: Look) -> None:
-        self._views, self._device, self._look = views, gaussians.device, look
-        self.view_ids = evenly(len(views), MOST_VIEWS)
-        self._model, self._before = gaussians, self.psnr(gaussians)
-        self.before = fmean(self._before)
 
-    def psnr(self, gaussians: Gaussians) -> list[float]:
-        """[`view_ids`] PSNR in dB of a model in the scene's frame, on any device."""
-        return [self._psnr(self.image(gaussians, view), view) for view in self.view_ids]
-
-    def _psnr(self, image: torch.Tensor, view_id: int) -> float:
-        photo, mask = self.photo(view_id), self.mask(view_id)
-        return psnr(image, photo) if mask is None else psnr(image[mask], photo[mask])
-
-    def image(self, gaussians: Gaussians, view_id: int) -> torch.Tensor:
-        """[H, W, 3] float32, 0 .. 1, on the device: a model seen by one of the test cameras."""
-        model = gaussians.map(lambda value: value.to(self._device))
-        views = replace(self._views, cameras=self._views.cameras.to(self._device), masks=None)
-        look = replace(self._look, sh_degree=min(self._look.sh_degree, model.sh_degree))
-        return render_view(model, views, view_id, look)
-
-    def photo(self, view_id: int) -> torch.Tensor:
-        """[H, W, 3] float32, 0 .. 1, on the device: a transparent one on the background that the model has."""
-        return self._views.photos.image(view_id, self._look.background).to(self._device)
-
-    def mask(self, view_id: int) -> torch.Tensor | None:
-        """[H, W] bool on the device, True where a pixel counts; None where all do."""
-        mask = self._views.mask(view_id)
-        return None if mask is None else mask.to(self._device)
-
-    def change(self, gaussians: Gaussians) -> Change:
-        """What became of the model."""
-        counts = (len(self.view_ids), len(self._views))
-        if not len(gaussians):
-            return Change(self.before, math.nan, *counts)
-        after = self.psnr(gaussians)
-        losses = [before - now for before, now in zip(self._before, after, strict=True)]
-        place = int(np.argmax(losses))
-        worst = (self._views.names[self.view_ids[place]], losses[place])
-        pairs = zip(self._model.items(), gaussians.items(), strict=True)
-        equal = all(torch.equal(value, other.to(value.device)) for (_, value), (_, other) in pairs)
-        return Change(self.before, fmean(after), *counts, *worst, equal)
+def view_psnr(model: Gaussians, views: PosedImages, view_id: int, look: Look) -> float:
+    """PSNR in dB of a model in one view, on the model's device, as an evaluation measures it."""
+    shown = replace(views, cameras=views.cameras.to(model.device), masks=None)
+    image = render_view(model, shown, view_id, replace(look, sh_degree=min(look.sh_degree, model.sh_degree)))
+    photo, mask = views.photos.image(view_id, look.background).to(model.device), views.mask(view_id)
+    if mask is None:
+        return psnr(image, photo)
+    return psnr(image[mask.to(model.device)], photo[mask.to(model.device)])

@@ -1,19 +1,20 @@
-"""Films of a model: 60 frames a second along a path of cameras, encoded by the ffmpeg of imageio-ffmpeg."""
+"""Films of a model along a path of cameras, 60 frames a second, encoded by the ffmpeg of imageio-ffmpeg."""
 
 from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.camera_path import from_file, orbit, through_views
 from turbogs_plugin.files import require_new_file, require_writable
-from turbogs_plugin.report.pictures import to_uint8
+from turbogs_plugin.report.evaluation import open_saved
+from turbogs_plugin.report.images import to_uint8
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.evaluate import Look
 from turbogs_plugin.types import Cameras, Gaussians
@@ -23,24 +24,46 @@ RATE = 60
 PATHS = ("orbit", "views")
 SUFFIXES = (".mp4", ".mkv", ".mov")
 CODEC = "libx264"
-"""Of H.264, which all of these hold; named, because imageio-ffmpeg would try others first."""
+"""Encoder of H.264, which all of these files hold; imageio-ffmpeg would try others first."""
 INSTALL = 'pip install "turbogs-plugin[video]"'
 QUALITY = 8
-"""Of imageio-ffmpeg, 0 .. 10."""
+"""Quality for imageio-ffmpeg, 0 .. 10."""
+
+
+def film_run(
+    path: Path, camera_path: str, video: Path, seconds: float, device_name: str, given: Config | None = None
+) -> Path:
+    """Write a film of a run's newest model or of a given one.
+
+    Args:
+        path: folder of the run, or the file of a model.
+        camera_path: orbit, views, or a file of cameras.
+        video: new file.
+        seconds: length of the film.
+        device_name: where to render.
+        given: the capture of a model from a file, and how to render it; None: `path` is a run.
+
+    Raises:
+        InputError: an option does not fit, no such model, or no usable capture.
+    """
+    require_film(camera_path, video, seconds)
+    model, scene = open_saved(path, device_name, given)
+    write_film(model.gaussians, model.own_look(scene.train), film_cameras(camera_path, scene, seconds), video)
+    return video
 
 
 def require_film(path: str, video: Path, seconds: float) -> None:
     """Raise `InputError`, before anything is loaded, where a film cannot be made."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise InputError(f"--video needs imageio-ffmpeg: {INSTALL}")
+        raise InputError(f"a film needs imageio-ffmpeg: {INSTALL}")
     if not 0 < seconds <= 3600:
         raise InputError(f"--seconds {seconds:g}: it must be more than 0 and at most 3600")
-    if video.suffix.lower() not in SUFFIXES:
-        raise InputError(f"--video '{video}': name a new file that ends in {', '.join(SUFFIXES)}")
     if path not in PATHS and not Path(path).is_file():
         raise InputError(f"--path '{path}': it must be orbit, views, or a file of cameras")
-    require_new_file(video, "--video")
-    require_writable(video.parent, f"--video '{video}'")
+    if video.suffix.lower() not in SUFFIXES:
+        raise InputError(f"--out '{video}': a film needs a new file that ends in {', '.join(SUFFIXES)}")
+    require_new_file(video, "--out")
+    require_writable(video.parent, f"--out '{video}'")
 
 
 def film_cameras(path: str, scene: Scene, seconds: float) -> Cameras:
@@ -64,6 +87,8 @@ def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) 
         InputError: the encoder refused.
     """
     import imageio_ffmpeg
+    from rich.console import Console
+    from rich.progress import track
 
     width, height = (cameras.sizes[0] // 2 * 2).tolist()
     cameras = cameras.to(gaussians.device)
@@ -73,27 +98,14 @@ def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) 
     writer = imageio_ffmpeg.write_frames(str(temporary), (width, height), **options)
     try:
         writer.send(None)
-        for frame in _told(len(cameras)):
+        told = Console(stderr=True)
+        for frame in track(range(len(cameras)), "frames", console=told, disable=not sys.stderr.isatty()):
             image = render_image(gaussians, cameras, frame, **look.options)
             writer.send(np.ascontiguousarray(to_uint8(image.colors)[:height, :width]))
         writer.close()
         temporary.replace(video)
     except OSError as error:  # of the pipe to the encoder
-        raise InputError(f"--video '{video}' cannot be encoded: {' '.join(str(error).split())[:200]}") from None
+        raise InputError(f"--out '{video}' cannot be encoded: {' '.join(str(error).split())[:200]}") from None
     finally:
         writer.close()
         temporary.unlink(missing_ok=True)
-
-
-def _told(frames: int) -> Iterator[int]:
-    """The numbers of frames, each told once it is done: by a bar on a terminal, by a line for each tenth elsewhere."""
-    if sys.stderr.isatty():
-        from rich.console import Console
-        from rich.progress import track
-
-        yield from track(range(frames), "frames", console=Console(stderr=True))
-        return
-    for frame in range(frames):
-        yield frame
-        if (frame + 1) * 10 // frames != frame * 10 // frames:
-            print(f"frame {frame + 1}/{frames}", file=sys.stderr, flush=True)

@@ -1,21 +1,32 @@
-"""What a measurement depends on besides its inputs: machine, versions, kernels, commit; and its day."""
+"""The conditions of a measurement besides its inputs: machine, versions, kernels, commit and day."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import platform
+import shlex
 import subprocess
+import sys
 from dataclasses import dataclass
 from datetime import datetime, timezone
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import torch
+
+from turbogs_plugin import __version__
+from turbogs_plugin.device import processor_cores
 from turbogs_plugin.engine import compiled_kernels
-from turbogs_plugin.report.machine import hardware, software
+
+PACKAGES = ("torch", "gsplat", "numpy", "pycolmap")
+"""Packages whose versions change results."""
 
 COMMIT_VARIABLE = "TURBOGS_COMMIT"
 """Environment variable that names the commit where the sources are a copy without their history."""
 
 MODIFIED = "-modified"
-"""End of the commit of sources that differ from it."""
+"""End of the commit's name where the sources differ from it."""
 
 
 @dataclass
@@ -46,6 +57,46 @@ def provenance(device_type: str) -> Provenance:
         engine = f"none, the torch reference ran: {reason}"
     day = datetime.now(timezone.utc).date().isoformat()
     return Provenance(hardware(device_type), dict(software()), engine, source_commit(), day)
+
+
+def software() -> list[tuple[str, str]]:
+    """Name and version of the software that a result depends on."""
+    versions = [("turbogs-plugin", __version__), ("Python", platform.python_version())]
+    for package in PACKAGES:
+        try:
+            versions.append((package, version(package)))
+        except PackageNotFoundError:
+            versions.append((package, "not installed"))
+    return [*versions, ("CUDA of torch", torch.version.cuda or "none")]
+
+
+def hardware(device: str) -> str:
+    """The machine in words: its processor, and on `cuda` its first GPU."""
+    processor = f"{_processor_name()}, {processor_cores()} cores"
+    if device != "cuda":
+        return processor
+    properties = torch.cuda.get_device_properties(0)
+    return f"{properties.name} ({properties.total_memory / 2**30:.0f} GiB), {processor}"
+
+
+def _processor_name() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            names = [line.split(":", 1)[1].strip() for line in file if line.startswith("model name")]
+    except OSError:
+        names = []
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def missing_bytecode() -> str:
+    """A remedy where Python compiles all of torch each time that a command begins; empty where it does not."""
+    if Path(importlib.util.cache_from_source(torch.__file__)).is_file():
+        return ""
+    packages = shlex.quote(str(Path(torch.__file__).parents[1]))
+    return (
+        "bytecode of torch: every command compiles it anew, for seconds; make it once by  "
+        f"{shlex.quote(sys.executable)} -m compileall -q -j 0 {packages}"
+    )
 
 
 def source_commit() -> str:

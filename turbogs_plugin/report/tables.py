@@ -19,7 +19,7 @@ FURTHER_KINDS = {
 }
 
 FURTHER = {f"{kind}_{name}": f"{head} {said}" for kind, said in FURTHER_KINDS.items() for name, head in ERRORS.items()}
-"""The same of `FurtherErrors`."""
+"""Measure of `FurtherErrors` -> head of its column."""
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -30,19 +30,18 @@ def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def number(value: float, digits: int, absent: str = "not computed") -> str:
-    """A number for a table, with so many digits behind the point; `absent` for NaN."""
+    """A number for a table, with `digits` behind the point; `absent` for NaN."""
     return absent if math.isnan(value) else f"{value:.{digits}f}"
 
 
 def errors(measured: ViewMetrics | Evaluation, columns: Iterable[str] = ERRORS, psnr_digits: int = 2) -> list[str]:
-    """The numbers of these measures."""
+    """The values of some measures as cells of a table."""
     return [number(getattr(measured, name), psnr_digits if "psnr" in name else 4) for name in columns]
 
 
 def error_columns(metrics: Metrics) -> dict[str, str]:
-    """Measure -> head of its column, of all that a model's test views have: `ERRORS`, LPIPS, FLIP where it was
-    computed, errors with masked pixels where there are any, and those after colour alignment where that was asked for.
-    """
+    """Measure -> head of its column, for all measures of a model's test views: `ERRORS`, LPIPS, FLIP where it was
+    computed, and the kinds of `FurtherErrors` that were."""
     computed = {name for name, value in metrics.mean.further().items() if name.endswith("l1") and not math.isnan(value)}
     further = {name: head for name, head in FURTHER.items() if f"{name.partition('_')[0]}_l1" in computed}
     flip = {} if all(math.isnan(view.flip) for view in metrics.views) else {"flip": "FLIP"}
@@ -59,7 +58,7 @@ def views_table(metrics: Metrics, with_means: bool = False) -> str:
 
 
 def history_rows(history: Iterable[Evaluation]) -> list[list[str]]:
-    """Error against run time: iteration, seconds of training, `ERRORS`, Gaussians, MiB of memory of each evaluation."""
+    """Rows of a history, one an evaluation: iteration, seconds of training, `ERRORS`, Gaussians, MiB of memory."""
     rows = []
     for entry in history:
         cells = [str(entry.iteration), f"{entry.train_seconds:.1f}", *errors(entry), str(entry.num_gaussians)]

@@ -1,4 +1,4 @@
-"""What TensorBoard shows of a training: its history as curves, and strips of its test views (`report.tensorboard`).
+"""Event files for TensorBoard (`report.tensorboard`): a training's history as curves, and strips of its test views.
 
 Evaluations stop the clock of training, so the event files cost no time that is reported.
 """
@@ -16,7 +16,7 @@ from PIL import Image
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.report.pictures import strip
+from turbogs_plugin.report.images import strip
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.evaluate import render_view
 from turbogs_plugin.train.history import Evaluation
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 INSTALL = 'pip install "turbogs-plugin[tensorboard]"'
 WIDEST_STRIP = 900
 """Pixels. A strip of every view at every evaluation would take hundreds of megabytes at full size."""
-GROUPS = dict.fromkeys(("num_gaussians", "nonfinite_losses", "skipped_updates"), "counts")
-GROUPS |= dict.fromkeys(("train_seconds", "memory_bytes"), "cost")
-"""Where TensorBoard shows a field of `Evaluation`; the others are errors on test views."""
+GROUPS = {"num_gaussians": "counts", "nonfinite_losses": "counts", "skipped_updates": "counts"}
+GROUPS |= {"train_seconds": "cost", "memory_bytes": "cost"}
+"""Group under which TensorBoard shows a field of `Evaluation`; all others are errors on test views."""
 
 
 def event_writers(config: Config) -> list[Callable[[RunSession], Listener]]:
-    """What a run with this configuration has to be watched by: one that writes event files, or none.
+    """Makers of the listeners that a run with this configuration needs: one that writes event files, or none.
 
     Raises:
         InputError: event files are asked for, and the package is not installed.
@@ -53,7 +53,7 @@ class EventWriter(Listener):
         folder: of the files; made with the first of them.
         test: the test views, on any device.
         strips: views shown as pictures, at most.
-        first: what earlier files have from this iteration on is void.
+        first: points of earlier files from this iteration on are void.
     """
 
     def __init__(self, folder: Path, test: PosedImages, strips: int, first: int = 0) -> None:
@@ -62,7 +62,7 @@ class EventWriter(Listener):
 
     @classmethod
     def of_run(cls, session: RunSession) -> EventWriter:
-        """Of a run, new or resumed: the history of a resumed run is that up to its checkpoint."""
+        """The writer of a run, new or resumed: a resumed run's history ends at its checkpoint."""
         first = session.trainer.iteration + 1 if session.resumed else 0
         return cls(session.folder.tensorboard, session.test, session.trainer.config.report.strips, first)
 
@@ -70,8 +70,6 @@ class EventWriter(Listener):
         iteration = evaluation.iteration
         if self._writer is None:
             self._writer = _writer_class()(str(self.folder), purge_step=self._first)
-            if not self._first:
-                self._writer.add_text("configuration", f"```yaml\n{loop.trainer.config.to_yaml()}\n```", iteration)
         for name, value in asdict(evaluation).items():
             if name != "iteration" and not math.isnan(value):
                 self._writer.add_scalar(f"{GROUPS.get(name, 'test')}/{name}", value, iteration)
@@ -89,7 +87,7 @@ class EventWriter(Listener):
             self._writer = None
 
     def _strip(self, loop: TrainingLoop, view: int) -> np.ndarray:
-        """[H, W, 3] uint8, at most `WIDEST_STRIP` wide: photo, render and error of a test view."""
+        """Photo, render and error of a test view, [H, W, 3] uint8, at most `WIDEST_STRIP` wide."""
         trainer, look = loop.trainer, loop.trainer.look(self._test.names)
         views = replace(self._test, cameras=self._test.cameras.to(trainer.device))
         image = render_view(trainer.gaussians, views, view, look)

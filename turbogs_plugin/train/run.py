@@ -127,7 +127,7 @@ def train(
     """Train from the start into a new folder. The plan is printed first. Photos alone are reconstructed before.
 
     Args:
-        report: called with the finished run; `turbogs_plugin.report.pages.write_report` writes its page.
+        report: called with the finished run; `turbogs_plugin.report.run_report.write_report` writes its page.
         clock: of the wall; None: it begins now.
         ranks: the processes that train this model together; each calls this, and the first one writes and prints.
         watch: further listeners.

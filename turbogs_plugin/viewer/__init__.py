@@ -1,4 +1,5 @@
-"""The live viewer: what is drawn (`pictures`), when (`frames`), for a training or a model, on a web page (`page`).
+"""The live viewer of a training, a run or a model: a web page by viser.
 
-Only `page` knows viser. Everything else is plain functions of a model and a camera, and tested without it.
+`pictures` draws, `frames` decides when and how large, `server` is the page, `live` attaches to a training, and
+`show` opens a run or a file. Only `server` knows viser; the others are plain functions of a model and a camera.
 """

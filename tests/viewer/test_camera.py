@@ -8,13 +8,13 @@ import torch
 from helpers.framework_runs import tiny_capture
 
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.viewer.eye import FOV_LIMITS, LARGEST_SIDE, SMALLEST_SIDE, Eye
+from turbogs_plugin.viewer.camera import FOV_LIMITS, LARGEST_SIDE, SMALLEST_SIDE, ViewerCamera
 
 GOOD = {"position": (1.0, 2.0, 3.0), "wxyz": (2.0, 0.0, 0.0, 0.0), "fov": 1.0, "width": 640, "height": 480}
 
 
 def test_a_sound_camera_is_taken_with_a_unit_quaternion():
-    assert Eye.checked(**GOOD) == Eye((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), 1.0, 640, 480)
+    assert ViewerCamera.checked(**GOOD) == ViewerCamera((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), 1.0, 640, 480)
 
 
 @pytest.mark.parametrize(
@@ -40,22 +40,22 @@ def test_a_sound_camera_is_taken_with_a_unit_quaternion():
     ],
 )
 def test_what_is_no_camera_is_refused(bad):
-    assert Eye.checked(**(GOOD | bad)) is None
+    assert ViewerCamera.checked(**(GOOD | bad)) is None
 
 
 def test_sizes_and_angles_are_brought_within_limits():
-    huge = Eye.checked(**(GOOD | {"width": 10**9, "height": 5 * 10**8, "fov": 100.0}))
+    huge = ViewerCamera.checked(**(GOOD | {"width": 10**9, "height": 5 * 10**8, "fov": 100.0}))
     assert (huge.width, huge.height, huge.fov) == (LARGEST_SIDE, LARGEST_SIDE // 2, FOV_LIMITS[1])
-    thin = Eye.checked(**(GOOD | {"width": 10**6, "height": 1}))
+    thin = ViewerCamera.checked(**(GOOD | {"width": 10**6, "height": 1}))
     assert (thin.width, thin.height) == (LARGEST_SIDE, SMALLEST_SIDE)
-    small = Eye.checked(**GOOD).with_at_most(160 * 120)
+    small = ViewerCamera.checked(**GOOD).with_at_most(160 * 120)
     assert (small.width, small.height) == (160, 120)
 
 
 def test_the_eye_of_a_view_is_its_camera(tmp_path):
     cameras = load_scene(tiny_capture(tmp_path)).train.cameras
     for view in range(len(cameras)):
-        found = Eye.of_view(cameras, view).cameras(torch.device("cpu"))
+        found = ViewerCamera.of_view(cameras, view).cameras(torch.device("cpu"))
         torch.testing.assert_close(found.viewmats[0], cameras.viewmats[view], atol=1e-5, rtol=0)
         assert found.Ks[0, 1, 1].item() == pytest.approx(cameras.Ks[view, 1, 1].item(), rel=1e-5)
         assert np.array_equal(found.sizes[0], cameras.sizes[view])

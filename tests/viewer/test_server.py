@@ -7,42 +7,22 @@ import socket
 import subprocess
 import sys
 import threading
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import TINY, assert_identical
 
-from turbogs_plugin import cli
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
-from turbogs_plugin.report.pictures import to_uint8
+from turbogs_plugin.report.images import to_uint8
 from turbogs_plugin.scene import Frame
-from turbogs_plugin.viewer import page as page_module
-from turbogs_plugin.viewer.commands import Shown, open_shown, show
-from turbogs_plugin.viewer.controls import Controls
-from turbogs_plugin.viewer.eye import Eye
+from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.live import LiveViewer
-from turbogs_plugin.viewer.page import INSTALL, Page, address, require_free
 from turbogs_plugin.viewer.pictures import Picture, Request, draw
-from turbogs_plugin.viewer.subject import Subject
-
-
-@contextmanager
-def shown(subject: Subject):
-    """A page that shows a model, from a thread of its own."""
-    pytest.importorskip("viser")
-    page, over = Page("127.0.0.1", 0), threading.Event()
-    thread = threading.Thread(target=show, args=(Shown(subject, "a model"), page, over.is_set))
-    thread.start()
-    try:
-        yield page
-    finally:
-        over.set()
-        thread.join()
-        page.close()
+from turbogs_plugin.viewer.server import INSTALL, Page, address, require_server
+from turbogs_plugin.viewer.show import open_state
 
 
 def connected(page: Page, **headers: str):
@@ -51,26 +31,26 @@ def connected(page: Page, **headers: str):
     return WaitingClient(page.url, **headers)
 
 
-def test_the_first_frames_are_our_renders(subject):
-    cameras = subject.capture.train.cameras
-    with shown(subject) as page:
+def test_the_first_frames_are_our_renders(shown, state):
+    cameras = state.capture.train.cameras
+    with shown(state) as page:
         for view in (0, 3, 6):
             with connected(page) as client:
-                client.look(Eye.of_view(cameras, view))
+                client.look(ViewerCamera.of_view(cameras, view))
                 frame = client.next_frame(lossless=True).pixels()
-            image = render_image(subject.gaussians, cameras, view, sh_degree=subject.sh_degree)
+            image = render_image(state.gaussians, cameras, view, sh_degree=state.sh_degree)
             assert np.abs(frame.astype(int) - to_uint8(image.colors)).max() <= 2
 
 
-def test_pictures_and_views_are_chosen_on_the_page(subject):
-    eye = Eye.of_view(subject.capture.train.cameras, 0)
-    with shown(subject) as page, connected(page) as client:
+def test_pictures_and_views_are_chosen_on_the_page(shown, state):
+    eye = ViewerCamera.of_view(state.capture.train.cameras, 0)
+    with shown(state) as page, connected(page) as client:
         client.look(eye)
         client.next_frame(lossless=True)
-        for picture, view in ((Picture.DEPTH, 0), (Picture.COMPARE, 2), (Picture.ERRORS, 4), (Picture.TILES, 4)):
+        for picture, view in ((Picture.DEPTH, 0), (Picture.COMPARE, 2), (Picture.ERRORS, 4), (Picture.RENDER, 4)):
             page.choose_view(view)
             client.press(page._pictures._impl.uuid, picture.value)
-            expected = draw(subject, Request(picture, eye, view))
+            expected = draw(state, Request(picture, eye, view))
             for _ in range(5):  # the choice of a view may be drawn on the way
                 if np.array_equal(client.next_frame(lossless=True).pixels(), expected):
                     break
@@ -78,9 +58,9 @@ def test_pictures_and_views_are_chosen_on_the_page(subject):
                 pytest.fail(f"{picture.value} did not come")
 
 
-def test_moving_frames_are_jpeg(subject):
-    eye = Eye.of_view(subject.capture.train.cameras, 0)
-    with shown(subject) as page, connected(page) as client:
+def test_moving_frames_are_jpeg(shown, state):
+    eye = ViewerCamera.of_view(state.capture.train.cameras, 0)
+    with shown(state) as page, connected(page) as client:
         client.look(eye)
         client.next_frame(lossless=True)
         client.look(dataclasses.replace(eye, fov=eye.fov * 0.9))
@@ -113,18 +93,18 @@ HOSTILE = (
 )
 
 
-def test_a_hostile_client_ends_nothing(subject):
+def test_a_hostile_client_ends_nothing(shown, state):
     pytest.importorskip("viser")
     from websockets.exceptions import ConnectionClosed
 
-    eye = Eye.of_view(subject.capture.train.cameras, 0)
-    with shown(subject) as page:
+    eye = ViewerCamera.of_view(state.capture.train.cameras, 0)
+    with shown(state) as page:
         with connected(page) as client:
             client.look(eye)
             client.next_frame()
         for camera in HOSTILE:
             with connected(page) as client:
-                client.look(Eye(*camera))
+                client.look(ViewerCamera(*camera))
                 with pytest.raises((TimeoutError, ConnectionClosed)):
                     client.next_frame(timeout=0.3)
                 page.go_to(3)  # moves every client's camera, as far as it has one
@@ -139,15 +119,15 @@ def test_a_hostile_client_ends_nothing(subject):
             assert max(wide.shape) <= 1920
             client.say({"type": "ShareUrlRequest"})
         assert page.server._share_tunnel is None
-        assert page.picture in Picture and 0 <= page.view < len(subject.capture)
+        assert page.picture in Picture and 0 <= page.view < len(state.capture)
 
 
-def test_scripts_of_other_pages_are_turned_away(subject):
+def test_scripts_of_other_pages_are_turned_away(shown, state):
     pytest.importorskip("viser")
     from websockets.exceptions import ConnectionClosed
 
-    eye = Eye.of_view(subject.capture.train.cameras, 0)
-    with shown(subject) as page:
+    eye = ViewerCamera.of_view(state.capture.train.cameras, 0)
+    with shown(state) as page:
         with pytest.raises(ConnectionClosed), connected(page, Origin="http://elsewhere.example") as client:
             client.look(eye)
             client.next_frame(timeout=10.0)
@@ -160,27 +140,27 @@ def test_a_training_goes_on_while_a_client_looks(new_training, scene):
     pytest.importorskip("viser")
     alone = new_training()
     alone.run()
-    loop, page = new_training(), Page("127.0.0.1", 0, Controls())
+    loop, page = new_training(), Page("127.0.0.1", 0, training=True)
     live = LiveViewer(page).attach(loop.trainer, scene.test)
     loop.listeners.append(live)
     frames = []
 
     def look() -> None:
         with connected(page) as client:
-            client.look(Eye.of_view(loop.trainer.views.cameras, 0))
+            client.look(ViewerCamera.of_view(loop.trainer.views.cameras, 0))
             frames.append(client.next_frame())
             client.press(page._pause._impl.uuid, True)
             frames.append(client.next_frame(lossless=True))
             client.press(page._pause._impl.uuid, True)
 
-    page.controls.pause()  # until the client is there
+    page.controls.set_paused(True)  # until the client is there
     thread = threading.Thread(target=look)
     thread.start()
     page.refresh_controls()
     try:
         while not page.watched:
             page.controls.wait(0.02)
-        page.controls.resume()
+        page.controls.set_paused(False)
         loop.run()
         thread.join()
     finally:
@@ -195,8 +175,8 @@ def test_a_port_in_use_is_named():
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"cannot listen at 127.0.0.1:{port} .*: name another port"):
-            require_free("127.0.0.1", port)
-    require_free("127.0.0.1", port)
+            require_server("127.0.0.1", port)
+    require_server("127.0.0.1", port)
 
 
 @pytest.mark.parametrize(
@@ -204,13 +184,13 @@ def test_a_port_in_use_is_named():
     [
         ("127.0.0.1", -1, "1 to 65535"),
         ("127.0.0.1", 70000, "1 to 65535"),
-        ("no such host", 8080, "name an address of this machine"),
-        ("203.0.113.1", 8080, "name an address of this machine"),
+        ("no such host", 8080, "name another port or host"),
+        ("203.0.113.1", 8080, "name another port or host"),
     ],
 )
 def test_an_address_that_is_none_is_named(host, port, remedy):
     with pytest.raises(InputError, match=f"{port}.*{remedy}"):
-        require_free(host, port)
+        require_server(host, port)
 
 
 def test_a_port_below_zero_is_taken_for_a_port(turbogs, tmp_path, capture):
@@ -252,31 +232,8 @@ def test_a_command_with_a_viewer_shows_the_model_until_ctrl_c(capture, tmp_path)
     assert "viewer  http://localhost:" in err and "Traceback" not in err and "viser" not in said + err
 
 
-@pytest.mark.parametrize(
-    ("given", "taken"),
-    [
-        (["train", "S", "--viewer"], ["train", "S", "--viewer", "8080"]),
-        (["train", "S", "--viewer", "--out", "R"], ["train", "S", "--viewer", "8080", "--out", "R"]),
-        (["train", "S", "--viewer", "9000", "--out", "R"], ["train", "S", "--viewer", "9000", "--out", "R"]),
-        (["train", "--viewer", "train.iterations=3"], ["train", "--viewer", "8080", "train.iterations=3"]),
-        (["train", "S", "--viewer=9"], ["train", "S", "--viewer=9"]),
-        (["view", "R"], ["view", "R"]),
-    ],
-)
-def test_a_viewer_has_a_usual_port(given, taken):
-    assert cli._with_port(given) == taken
-
-
-@pytest.fixture
-def with_viser(monkeypatch):
-    """Commands come as far as if viser were there."""
-    from turbogs_plugin.viewer import commands
-
-    for module in (commands, page_module):
-        monkeypatch.setattr(module, "require_viser", lambda: None)
-
-
-def test_bad_input_is_one_line(turbogs, tmp_path, capture, with_viser):
+def test_bad_input_is_one_line(turbogs, tmp_path, capture):
+    pytest.importorskip("viser")
     points, empty = tmp_path / "points.ply", tmp_path / "empty"
     points.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
     empty.mkdir()
@@ -301,26 +258,26 @@ def test_bad_input_is_one_line(turbogs, tmp_path, capture, with_viser):
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_a_model_from_a_file_stands_before_the_eye(subject, tmp_path, name):
-    far = subject.gaussians.map(lambda value: value.clone())
+def test_a_model_from_a_file_stands_before_the_eye(state, tmp_path, name):
+    far = state.gaussians.map(lambda value: value.clone())
     far.means = far.means * 50.0 + torch.tensor([1000.0, -2000.0, 500.0])
     file = tmp_path / f"model{FORMATS[name].suffix}"
     FORMATS[name].write(far, file, Frame(np.zeros(3), 1.0), 0)
-    found = open_shown(file, torch.device("cpu"))
-    distances = found.subject.gaussians.means.norm(dim=1)
+    found, _ = open_state(file, torch.device("cpu"))
+    distances = found.gaussians.means.norm(dim=1)
     assert 0.85 < float((distances <= 1.01).float().mean()) < 0.95
-    assert found.subject.capture is None and found.title == file.name
+    assert found.capture is None
 
 
 def test_a_run_is_shown_with_its_error_maps_and_without_its_capture(turbogs, capture, tmp_path):
     out = tmp_path / "run"
     code, *_ = turbogs("train", capture, "--out", out, "--no-report", "--device", "cpu", *TINY)
     assert code == 0
-    found = open_shown(out, torch.device("cpu"))
-    assert len(found.subject.capture) == 8 and found.note == "" and found.subject.maps.errors.any()
-    eye = Eye.of_view(found.subject.capture.train.cameras, 0)
-    assert draw(found.subject, Request(Picture.AGES, eye, 0)).std() > 1
+    found, lacking = open_state(out, torch.device("cpu"))
+    assert len(found.capture) == 8 and lacking == "" and found.maps.errors.any()
+    eye = ViewerCamera.of_view(found.capture.train.cameras, 0)
+    assert draw(found, Request(Picture.AGES, eye, 0)).std() > 1
     config = out / "config.yaml"
     config.write_text(config.read_text().replace(str(capture), str(tmp_path / "gone")))
-    found = open_shown(out, torch.device("cpu"))
-    assert found.subject.capture is None and "gone" in found.note
+    found, lacking = open_state(out, torch.device("cpu"))
+    assert found.capture is None and "gone" in lacking

@@ -1,4 +1,4 @@
-"""What is looked at: a model, and where there is one, its capture and the state of its training."""
+"""The state that pictures show: a model, and where there is one, its capture and what its training keeps."""
 
 from __future__ import annotations
 
@@ -15,34 +15,29 @@ from turbogs_plugin.types import BLACK, Color, Gaussians, PixelSamples, RowUpdat
 
 @dataclass
 class DensityChange:
-    """What the last event of density control did.
+    """The last event of density control.
 
     Args:
-        iteration: when.
-        added: [N] bool, rows of the present model that it made.
-        removed: the Gaussians that it took away; one that was split is replaced, not removed.
-        num_cloned, num_split, num_pruned: as in `RowUpdate`.
+        iteration: when it happened.
+        update: what it did; its `fresh` are the rows of the present model that it added.
+        removed: the Gaussians that it took away; a Gaussian that was split is replaced, not removed.
     """
 
     iteration: int
-    added: torch.Tensor
+    update: RowUpdate
     removed: Gaussians
-    num_cloned: int
-    num_split: int
-    num_pruned: int
 
     @classmethod
     def of(cls, before: Gaussians, update: RowUpdate, iteration: int) -> DensityChange:
         """The change that `update` makes to the model `before` it."""
         gone = torch.ones(len(before), dtype=torch.bool, device=before.device)
         gone[update.source] = False
-        removed = before.map(lambda value: value[gone])
-        return cls(iteration, update.fresh, removed, update.num_cloned, update.num_split, update.num_pruned)
+        return cls(iteration, update, before.map(lambda value: value[gone]))
 
 
 @dataclass(frozen=True)
 class CaptureViews:
-    """The views of a capture under one numbering: those for training, then those for testing.
+    """The views of a capture under one numbering: training views, then test views.
 
     Args:
         train, test: cameras and photos, wherever their photos are kept.
@@ -66,18 +61,18 @@ class CaptureViews:
 
 
 @dataclass
-class Subject:
-    """All that a picture may show. What is None is not there, and pictures that need it say so.
+class ModelState:
+    """All that a picture may show. Pictures that need what is None say so.
 
     Args:
         gaussians: the model, on the device that renders.
         sh_degree: highest degree of spherical harmonics in use.
-        settings: those of the rasterizer.
+        settings: of the rasterizer.
         background: behind the model, and behind transparent photos.
         capture: its views, for training and for testing.
         maps: errors and ages of the training views.
         step: the time from which ages count.
-        samples: those of the last iteration.
+        samples: pixels of the last iteration.
         change: the last event of density control.
     """
 
@@ -93,5 +88,5 @@ class Subject:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Of rendering."""
+        """Options of `render_image`."""
         return {"sh_degree": self.sh_degree, "settings": self.settings, "background": self.background}

@@ -1,4 +1,4 @@
-"""``report.md``: what a run did and reached, readable on its own."""
+"""``report.md``, a page that tells what a run did and reached."""
 
 from __future__ import annotations
 
@@ -8,19 +8,15 @@ from pathlib import Path
 
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
-from turbogs_plugin.report.machine import hardware, software
-from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, picture_writer, strip
-from turbogs_plugin.report.plot_process import PlotProcess, SecondsPlot
+from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip
+from turbogs_plugin.report.provenance import hardware, software
 from turbogs_plugin.report.tables import ERRORS, error_columns, errors, history_rows, number, table, views_table
 from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
 from turbogs_plugin.train.session import RunSession
 
 
-def write_report(run: RunSession, process: PlotProcess | None = None) -> Path:
+def write_report(run: RunSession) -> Path:
     """Write ``report.md`` and its pictures (in ``report/``) into the run's folder.
-
-    Args:
-        process: draws the plots, meanwhile; None: they are drawn here.
 
     Returns:
         The page.
@@ -36,17 +32,11 @@ def write_report(run: RunSession, process: PlotProcess | None = None) -> Path:
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
     strips = min(len(run.test), config.report.strips)
-    plots = _plots(run, pictures)
-    if process is not None:
-        process.begin(plots)
-    with picture_writer() as write:
-        for view_id in range(strips):
-            image = render_view(trainer.gaussians, run.test, view_id, look)
-            photo = run.test.photos.image(view_id, look.background)
-            write(pictures / f"test-{view_id:03d}.jpg", strip(photo, image, run.test.mask(view_id)))
-        if process is None or not process.end():
-            for plot in plots:  # while the strips are encoded
-                plot.draw()
+    for view_id in range(strips):
+        image = render_view(trainer.gaussians, run.test, view_id, look)
+        photo = run.test.photos.image(view_id, look.background)
+        save_image(pictures / f"test-{view_id:03d}.jpg", strip(photo, image, run.test.mask(view_id)))
+    _plot(run, pictures)
     run.clock.mark("pictures and plots")
     run.finish_model()  # the page says how long it took until it was there
     write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, strips))
@@ -54,18 +44,17 @@ def write_report(run: RunSession, process: PlotProcess | None = None) -> Path:
     return run.folder.report
 
 
-def _plots(run: RunSession, pictures: Path) -> list[SecondsPlot]:
+def _plot(run: RunSession, pictures: Path) -> None:
+    from turbogs_plugin.report.curves import plot_against_seconds
+
     seconds = [evaluation.train_seconds for evaluation in run.history]
-
-    def plot(name: str, label: str) -> SecondsPlot:
+    for name, label in (("psnr", "test PSNR in dB"), ("l1", "mean absolute error on test views (0 .. 1)")):
         values = [getattr(evaluation, name) for evaluation in run.history]
-        return SecondsPlot(str(pictures / f"{name}.png"), seconds, values, label, run.scene.name)
-
-    return [plot("psnr", "test PSNR in dB"), plot("l1", "mean absolute error on test views (0 .. 1)")]
+        plot_against_seconds(pictures / f"{name}.png", seconds, values, label, run.scene.name)
 
 
 def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> str:
-    """The page.
+    """The text of the page.
 
     Args:
         metrics: of the final model.
@@ -97,7 +86,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
     seconds = f"{last.train_seconds:.1f}", number(run.wall.wall_seconds, 1, "not recorded")
     rows = history_rows(run.history)
     *_, memory = rows[-1]
-    cells = (*errors(metrics.mean, columns), *seconds, last.num_gaussians, f"{metrics.fps:.1f}", memory)
+    cells = (*errors(metrics.mean, columns), *seconds, str(last.num_gaussians), f"{metrics.fps:.1f}", memory)
     result = table(heads, [cells])
     lpips = f"\nLPIPS was not computed: {lpips_reason}.\n" if lpips_reason else ""
     history = table(("iteration", "training in s", *ERRORS.values(), "Gaussians", "peak memory in MiB"), rows)
@@ -106,7 +95,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
         for view_id, view in enumerate(metrics.views[:shown])
     )
     folder = shlex.quote(str(run.folder.path))
-    exported = "[report.html](report.html)" if (run.folder.path / "report.html").is_file() else "`report.html`"
+    exported = "[model.html](model.html)" if (run.folder.path / "model.html").is_file() else "`model.html`"
     return f"""# {run.scene.name}
 
 {last.iteration} iterations on {len(run.scene.train)} training views, seed {config.train.seed}; measured on
@@ -118,8 +107,7 @@ Means over the test views{unmasked}. Training time is that of iterations and of 
 evaluation, checkpoints and this report are not in it. Wall time is from the start of the process until the model was
 written. FPS counts test views rendered one after the other. FLIP: `turbogs eval {folder}`.{on}
 
-`turbogs export {folder} --format html` writes all of this and the model on one page,
-{exported}.
+`turbogs export {folder} --format html` writes a page with the model to turn in a browser, {exported}.
 
 ## Error against run time
 

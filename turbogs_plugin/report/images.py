@@ -1,10 +1,8 @@
-"""Pictures of views: strips of ground truth, render and error; depths."""
+"""Pictures of views as arrays of bytes: strips of photo, render and error; errors and depths in colours."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from turbogs_plugin.device import processor_cores
 from turbogs_plugin.files import naming
-from turbogs_plugin.report.inferno import INFERNO
 
 ERROR_FULL_SCALE = 0.25
 """Mean absolute error over RGB at which an error map has its brightest colour."""
@@ -29,33 +25,24 @@ GAP = 6
 """White pixels between the pictures of a strip."""
 
 JPEG_QUALITY = 92
-"""Of strips. With full resolution of colours they look as PNGs do, at a tenth of their time and size."""
-
-THREADS = 8
-"""Files that are encoded at a time; the encoders run without Python's lock."""
+"""Quality of a strip's JPEG. With full resolution of colours it looks as a PNG does, at a tenth of the size."""
 
 
-@contextmanager
-def picture_writer() -> Iterator[Callable[[Path, np.ndarray], None]]:
-    """Gives a function that writes a picture, [H, W, 3] uint8, to a file in a thread; the suffix says in which format.
+def save_image(path: Path, pixels: np.ndarray) -> None:
+    """Write a picture, [H, W, 3] uint8; the file's suffix says in which format.
 
-    Leaving waits for all files, and raises the first error.
+    Raises:
+        OSError: it cannot be written; the error names the file.
     """
-    jobs = []
-    with ThreadPoolExecutor(min(THREADS, processor_cores())) as pool:
-        yield lambda path, pixels: jobs.append(pool.submit(_save, path, pixels))
-    for job in jobs:
-        job.result()
-
-
-def _save(path: Path, pixels: np.ndarray) -> None:
-    options = {"quality": JPEG_QUALITY, "subsampling": 0} if path.suffix == ".jpg" else {}
     with naming(path):
-        Image.fromarray(pixels).save(path, **options)
+        if path.suffix == ".jpg":
+            Image.fromarray(pixels).save(path, quality=JPEG_QUALITY, subsampling=0)
+        else:
+            Image.fromarray(pixels).save(path)
 
 
 def strip(photo: Tensor, image: Tensor, mask: Tensor | None = None) -> np.ndarray:
-    """[H, 3 W + 2 `GAP`, 3] uint8: ground truth, render and error map side by side.
+    """Photo, render and error map side by side, [H, 3 W + 2 `GAP`, 3] uint8.
 
     Args:
         photo, image: [H, W, 3] float, 0 .. 1, on one device, where the strip is made.
@@ -69,12 +56,12 @@ def strip(photo: Tensor, image: Tensor, mask: Tensor | None = None) -> np.ndarra
 
 
 def error_picture(photo: Tensor, image: Tensor) -> Tensor:
-    """[H, W, 3] uint8: mean absolute error over RGB, black (none) to bright yellow (`ERROR_FULL_SCALE` and more)."""
+    """Mean absolute error over RGB, [H, W, 3] uint8: black (none) to bright yellow (`ERROR_FULL_SCALE` and more)."""
     return colored((photo - image).abs().mean(dim=-1) / ERROR_FULL_SCALE)
 
 
 def depth_picture(depths: np.ndarray) -> np.ndarray:
-    """[H, W, 3] uint8 of depths [H, W]: near is bright, far is dark, and what has no depth (0) is black.
+    """Depths [H, W] as a picture, [H, W, 3] uint8: near is bright, far is dark, no depth (0) is black.
 
     The scale of colours is even in 1 / depth, so that near depths have most of it, and goes from the 1st to the 99th
     percentile of 1 / depth in this image.
@@ -88,17 +75,26 @@ def depth_picture(depths: np.ndarray) -> np.ndarray:
     return colored(torch.from_numpy(FAINTEST + (1.0 - FAINTEST) * share)).numpy() * seen[..., None]
 
 
+@cache
+def _palette() -> Tensor:
+    """The colours of matplotlib's inferno, [256, 3] uint8: black to bright yellow."""
+    import matplotlib
+
+    colors = matplotlib.colormaps["inferno"](np.arange(256))[:, :3]
+    return torch.from_numpy((255.0 * colors).round().astype(np.uint8))
+
+
 def colored(share: Tensor) -> Tensor:
-    """[H, W, 3] uint8: black (0) to bright yellow (1 and more)."""
-    palette = torch.from_numpy(INFERNO.copy()).to(share.device)  # [256, 3]
+    """Shares [H, W] as colours, [H, W, 3] uint8: black (0) to bright yellow (1 and more)."""
+    palette = _palette().to(share.device)
     return palette[(share * len(palette)).clamp(0, len(palette) - 1).long()]
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
-    """[H, W, 3] uint8 of an image of floats 0 .. 1: `rounded`, on the CPU."""
+    """An image of floats 0 .. 1 as bytes on the CPU, [H, W, 3] uint8."""
     return rounded(image).cpu().numpy()
 
 
 def rounded(image: Tensor) -> Tensor:
-    """[H, W, 3] uint8 of an image of floats 0 .. 1, on its device."""
+    """An image of floats 0 .. 1 as bytes on its device, [H, W, 3] uint8."""
     return (image.clamp(0.0, 1.0) * 255.0).round().byte()

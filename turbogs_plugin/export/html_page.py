@@ -1,0 +1,101 @@
+"""One HTML file with a model to turn, which opens from the disk without a network: viser's own client holds the scene.
+
+viser's splats have one colour each. It is the mean of the colours that training cameras see, so what changes with the
+direction is lost, and how much that costs is measured and said on the page.
+"""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.engine.reference.projection import rotation_matrices
+from turbogs_plugin.engine.reference.spherical_harmonics import evaluate, unit_directions
+from turbogs_plugin.export.camera_path import focus_and_up
+from turbogs_plugin.scene.poses import evenly
+from turbogs_plugin.types import SH_C0, Cameras, Color, Gaussians
+from turbogs_plugin.viewer.camera import ViewerCamera
+from turbogs_plugin.viewer.server import quiet_server, stop
+
+MOST_DIRECTIONS = 24
+"""Training cameras, evenly spread, whose colours are averaged."""
+MAGNIFICATION = 10.0
+"""Factor on lengths: viser holds covariances in float16, which resolves none below 6e-8."""
+WIDEST = 25.0
+"""Largest standard deviation, in units of the scene's extent, whose covariance float16 holds."""
+
+
+def page_gaussians(gaussians: Gaussians, cameras: Cameras, sh_degree: int) -> Gaussians:
+    """The finite Gaussians of a model, each in the one colour that it has on the page; without higher bands.
+
+    Args:
+        gaussians: in the scene's frame, on any device.
+        cameras: of the training views.
+        sh_degree: highest degree in use.
+    """
+    finite = gaussians.finite_rows()
+    model = gaussians.map(lambda value: value[finite])
+    chosen = evenly(len(cameras), MOST_DIRECTIONS)
+    colors = torch.zeros_like(model.means)  # [N, 3]
+    for center in cameras.centers[chosen].to(model.means):
+        seen = evaluate(model.sh0, model.shN, unit_directions(model.means - center), sh_degree)
+        colors += (seen + 0.5).clamp(0.0, 1.0) / len(chosen)
+    return Gaussians(
+        means=model.means,
+        quats=model.quats,
+        scales=model.scales,
+        opacities=model.opacities,
+        sh0=((colors - 0.5) / SH_C0)[:, None],
+        shN=model.shN[:, :0],
+    )
+
+
+def html_page(gaussians: Gaussians, cameras: Cameras, background: Color, title: str, caption: str) -> str:
+    """The page.
+
+    Args:
+        gaussians: of `page_gaussians`.
+        cameras: of the training views; the page begins at the first one.
+        background: behind the model.
+        title: of the page.
+        caption: a line above the model.
+    """
+    server = quiet_server("127.0.0.1", 0)
+    try:
+        focus, up = focus_and_up(cameras)
+        first = ViewerCamera.of_view(cameras, 0)
+        server.scene.set_up_direction(up)
+        start = server.initial_camera
+        start.position = MAGNIFICATION * np.array(first.position)
+        start.look_at, start.up, start.fov = MAGNIFICATION * focus, up, first.fov
+        start.far = 1000.0 * MAGNIFICATION
+        pixel = np.array(background, dtype=np.float64).reshape(1, 1, 3)
+        server.scene.set_background_image((255.0 * pixel).round().astype(np.uint8), format="png")
+        server.scene.add_gaussian_splats(
+            "/model",
+            centers=_numpy(MAGNIFICATION * gaussians.means),
+            covariances=_numpy(MAGNIFICATION**2 * _covariances(gaussians)),
+            rgbs=_numpy(SH_C0 * gaussians.sh0[:, 0] + 0.5).clip(0.0, 1.0),
+            opacities=_numpy(torch.sigmoid(gaussians.opacities))[:, None],
+        )
+        page = server.scene.as_html(dark_mode=max(background) < 0.5)
+    finally:
+        stop(server)
+    style = "position:fixed;z-index:9;left:0;right:0;margin:.5em;font:13px sans-serif;color:#888;pointer-events:none"
+    head = f'<div style="{style}"><b>{escape(title)}</b> {escape(caption)}</div>'
+    page = page.replace("<title>Viser</title>", f"<title>{escape(title)}</title>", 1)
+    before, tag, after = page.partition("<body>")
+    return before + tag + head + after
+
+
+def _covariances(gaussians: Gaussians) -> Tensor:
+    """The covariances of N Gaussians, [N, 3, 3] float32, world units squared."""
+    axes = rotation_matrices(gaussians.quats) * gaussians.scales.exp().clamp(max=WIDEST)[:, None]
+    return axes @ axes.transpose(1, 2)
+
+
+def _numpy(values: Tensor) -> np.ndarray:
+    return values.detach().cpu().float().numpy()

@@ -1,0 +1,160 @@
+"""Models written for other programs: in every format, or as a page to turn them on (`turbogs export`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS, RasterSettings, dense_samples, rasterize
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.export.fidelity import Change, measure_change
+from turbogs_plugin.export.html_page import html_page, page_gaussians
+from turbogs_plugin.files import require_new_file, write_text_atomically
+from turbogs_plugin.model.formats import FORMATS
+from turbogs_plugin.model.similarity import Similarity
+from turbogs_plugin.train.saved_model import SavedModel, load_with_capture
+from turbogs_plugin.train.start import resolve_device
+from turbogs_plugin.types import Cameras, Gaussians
+
+PAGE = "html"
+"""Name of the page with the model to turn, which no program reads back."""
+MOST_ON_PAGE = 800_000
+"""Largest model of a page: 36 bytes a Gaussian make about 30 MB, which mail and chat programs take."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """The file that was written, beside the model that it was made of.
+
+    Args:
+        file: the new file.
+        gaussians: number of Gaussians in it.
+        held_bytes, of: bytes of the model in float32, and number of its Gaussians.
+        change: what the model lost; None where that was not measured.
+        unmeasured: why; empty where it was.
+        notes: what was left out on purpose.
+    """
+
+    file: Path
+    gaussians: int
+    held_bytes: int
+    of: int
+    change: Change | None
+    unmeasured: str = ""
+    notes: tuple[str, ...] = ()
+
+    def text(self) -> str:
+        """Three lines: the file, sizes, and what was lost."""
+        notes = f" ({'; '.join(self.notes)})" if self.notes else ""
+        size = f"{self.held_bytes:,} bytes in float32 -> {self.file.stat().st_size:,} bytes in the file"
+        lost = f"PSNR   not measured: {self.unmeasured}" if self.change is None else self.change.text()
+        return f"{self.file}{notes}\nsize   {size}, {self.gaussians} of {self.of} Gaussians\n{lost}"
+
+
+def export_run(
+    path: Path, file_format: str, out: Path | None, max_gaussians: int | None = None, given: Config | None = None
+) -> Exported:
+    """Write a run's newest model or a given one, and compare what was written with it.
+
+    Args:
+        path: folder of the run, or the file of a model.
+        file_format: one of `FORMATS`, or `PAGE`.
+        out: new file; None: beside the model in the run's folder.
+        max_gaussians: largest number of Gaussians to keep, those that add most to the training views; None: all.
+        given: the capture of a model from a file, and how to render it; None: `path` is a run.
+
+    Raises:
+        InputError: an option does not fit, no such model, or no usable capture where it is needed.
+    """
+    _require_options(path, file_format, out, max_gaussians, given)
+    is_page = file_format == PAGE
+    needed = max_gaussians is not None or is_page
+    model, scene, absent = load_with_capture(path, given, resolve_device("auto"), needed)
+    file = out or _beside(model, f".{PAGE}" if is_page else FORMATS[file_format].suffix)
+    if is_page:
+        max_gaussians = min(max_gaussians or MOST_ON_PAGE, MOST_ON_PAGE)
+    kept, whole = model.gaussians, model.gaussians
+    notes: tuple[str, ...] = ()
+    if scene is not None and max_gaussians is not None and max_gaussians < len(whole):
+        kept = pruned(whole, contributions(whole, scene.train.cameras, model.config.raster), max_gaussians)
+        notes = (f"the {len(kept)} of {len(whole)} Gaussians that add most to the training views",)
+    if is_page and scene is not None:
+        written = page_gaussians(kept, scene.train.cameras, model.sh_degree)
+    else:
+        notes += _blur_note(model.config.raster.eps2d)
+        FORMATS[file_format].write(kept, file, model.frame, model.iteration or 0)
+        written = Similarity.into(model.frame).apply(FORMATS[file_format].read(file)).map(torch.Tensor.float)
+    change = None
+    if scene is not None and len(scene.test):
+        change = measure_change(whole, written, scene.test, model.own_look(scene.test))
+    if is_page and scene is not None:
+        caption = f"{len(written):,} Gaussians, one colour each"
+        if change is not None:
+            caption += f": PSNR {change.after:.2f} dB on test views, {change.before:.2f} dB in the trained model"
+        background = model.own_look(scene.train).background
+        write_text_atomically(file, html_page(written, scene.train.cameras, background, scene.name, caption))
+    held = sum(value.numel() * 4 for _, value in whole.items())
+    reason = absent or "the capture has no test views"
+    return Exported(file, len(written), held, len(whole), change, reason, notes)
+
+
+def _require_options(
+    path: Path, file_format: str, out: Path | None, max_gaussians: int | None, given: Config | None
+) -> None:
+    """Raise `InputError` where options do not fit each other, before anything is loaded."""
+    if file_format not in (*FORMATS, PAGE):
+        known = ", ".join((*FORMATS, PAGE))
+        raise InputError(f"--format {file_format}: there is no such format; choose one of {known}")
+    if max_gaussians is not None and max_gaussians < 1:
+        raise InputError(f"--max-gaussians {max_gaussians}: it must be at least 1")
+    if out is not None:
+        require_new_file(out, "--out")
+        ending = PAGE if file_format == PAGE else FORMATS[file_format].suffix.rpartition(".")[2]
+        if out.suffix.lower() != f".{ending}":
+            raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in .{ending}")
+    elif given is not None:
+        raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
+    elif max_gaussians is not None and file_format == "ply":
+        raise InputError("--max-gaussians would replace the run's own model.ply: name a new file by --out")
+
+
+def _beside(model: SavedModel, suffix: str) -> Path:
+    assert model.folder is not None, "only a run is exported without --out"
+    return model.folder.model.with_suffix(suffix)
+
+
+def _blur_note(eps2d: float) -> tuple[str, ...]:
+    """The blur of the model's pixels, which no file holds, where other programs would not guess it."""
+    usual = DEFAULT_SETTINGS.eps2d
+    return () if eps2d == usual else (f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}",)
+
+
+@torch.no_grad()
+def contributions(gaussians: Gaussians, cameras: Cameras, settings: RasterSettings) -> Tensor:
+    """The sum of each Gaussian's blending weights T * alpha over all pixels of some views.
+
+    Args:
+        cameras: of the views; on any device.
+
+    Returns:
+        [N] float64, on the Gaussians' device.
+    """
+    cameras = cameras.to(gaussians.device)
+    sums = torch.zeros(len(gaussians), dtype=torch.float64, device=gaussians.device)
+    for view in range(len(cameras)):
+        samples = dense_samples(cameras, [view])
+        rendered = rasterize(gaussians, cameras.select([view]), samples, sh_degree=0, settings=settings)
+        screen = rendered.backward(torch.zeros_like(rendered.colors))
+        sums += screen.full_records()[0, :, ScreenRecord.WEIGHT_SUM]
+    return sums
+
+
+def pruned(gaussians: Gaussians, weights: Tensor, count: int) -> Gaussians:
+    """The `count` Gaussians with the largest of the `weights` [N], in their order."""
+    kept = torch.argsort(weights, descending=True, stable=True)[:count].sort().values
+    return gaussians.map(lambda value: value[kept])

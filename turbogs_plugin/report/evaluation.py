@@ -1,0 +1,58 @@
+"""Errors of a saved model on its test views, as `turbogs eval` prints them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.report.tables import views_table
+from turbogs_plugin.scene import PosedImages, Scene
+from turbogs_plugin.scene.offload import place_views
+from turbogs_plugin.train.evaluate import Look, evaluate, load_lpips
+from turbogs_plugin.train.flip import load_flip
+from turbogs_plugin.train.interpolated_exposures import interpolated_exposures
+from turbogs_plugin.train.saved_model import SavedModel, load_with_capture
+from turbogs_plugin.train.start import resolve_device
+
+
+def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> str:
+    """Errors of a run's newest model, or of a given one, on each test view, as a table.
+
+    Args:
+        path: folder of the run, or the file of a model.
+        device_name: where to render.
+        given: the capture of a model from a file, and how to render it; None: `path` is a run.
+    """
+    model, scene = open_saved(path, device_name, given)
+    views, look = views_of(model, scene, "test")
+    views = place_views(views, model.gaussians.device, model.config.train.photos_place)
+    lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
+    flip, no_flip = load_flip()
+    metrics = evaluate(model.gaussians, views, look, lpips, flip, aligned=True, refined=True)
+    note = f"\nLPIPS was not computed: {reason}" if reason else ""
+    note += f"\nFLIP was not computed: {no_flip}" if no_flip else ""
+    which = f"iteration {model.iteration}" if given is None else str(path)
+    speed = f"{len(model.gaussians)} Gaussians, {metrics.fps:.1f} views a second"
+    return f"{views_table(metrics, with_means=True)}\n\n{which}, {speed}{note}"
+
+
+def open_saved(path: Path, device_name: str, given: Config | None) -> tuple[SavedModel, Scene]:
+    """A run's newest model or a given one on a device, and its capture on the CPU.
+
+    Raises:
+        InputError: no such model, or no usable capture.
+    """
+    model, scene, _ = load_with_capture(path, given, resolve_device(device_name))
+    assert scene is not None, "the capture is needed"
+    return model, scene
+
+
+def views_of(model: SavedModel, scene: Scene, split: str) -> tuple[PosedImages, Look]:
+    """The views of a split, test or train, and how the model is shown beside them: with the exposures of training
+    photos, where the run learnt them, or what these tell of the test photos."""
+    views = scene.test if split == "test" else scene.train
+    exposures = model.exposures
+    if exposures is not None and split == "test":
+        exposures = interpolated_exposures(exposures, scene.train.names, scene.test.names)
+    return views, replace(model.own_look(views), exposures=exposures)

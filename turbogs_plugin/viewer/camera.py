@@ -1,0 +1,92 @@
+"""The camera of a page of the viewer: checked as a client tells it, and as an engine renders it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from turbogs_plugin.engine.reference.projection import rotation_matrices
+from turbogs_plugin.scene.poses import quaternions
+from turbogs_plugin.types import Cameras
+
+SMALLEST_SIDE, LARGEST_SIDE = 16, 1920
+"""Bounds of a frame's sides in pixels, whatever size a client claims to have."""
+FARTHEST = 1e6
+"""Largest coordinate of a camera, in units of the scene's extent; beyond, float32 resolves nothing."""
+FOV_LIMITS = (math.radians(1.0), math.radians(170.0))
+
+
+@dataclass(frozen=True)
+class ViewerCamera:
+    """A pinhole camera whose principal point is the middle of its image.
+
+    Args:
+        position: in the model's world.
+        wxyz: unit quaternion of the rotation from the camera (x right, y down, z forward) to the world.
+        fov: vertical, radians.
+        width, height: of the image, pixels.
+    """
+
+    position: tuple[float, float, float]
+    wxyz: tuple[float, float, float, float]
+    fov: float
+    width: int
+    height: int
+
+    @classmethod
+    def checked(
+        cls, position: Iterable[float], wxyz: Iterable[float], fov: float, width: float, height: float
+    ) -> ViewerCamera | None:
+        """The camera that a client claims to have; None if it is none. Sizes and angles are brought within limits, with
+        the image's proportions kept as far as both sides allow."""
+        try:
+            numbers = np.array([*position, *wxyz, fov, width, height], dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            return None
+        if numbers.shape != (10,) or not np.isfinite(numbers).all() or numbers[7:].min() <= 0:
+            return None
+        place, turn, sides = numbers[:3], numbers[3:7], numbers[8:]
+        if not 1e-6 < np.abs(turn).max() < 1e6 or np.abs(place).max() > FARTHEST:
+            return None
+        scaled = sides * min(1.0, LARGEST_SIDE / sides.max())
+        angle = float(np.clip(numbers[7], *FOV_LIMITS))
+        return cls._of(place, turn / np.linalg.norm(turn), angle, np.clip(scaled.round(), SMALLEST_SIDE, LARGEST_SIDE))
+
+    @classmethod
+    def of_view(cls, cameras: Cameras, view_id: int) -> ViewerCamera:
+        """The camera of a capture's view; the principal point moves to the centre."""
+        viewmat = cameras.viewmats[view_id].double().cpu().numpy()
+        rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
+        fov = 2.0 * math.atan(cameras.sizes[view_id, 1] / (2.0 * float(cameras.Ks[view_id, 1, 1])))
+        return cls._of(-rotation.T @ translation, quaternions(rotation.T[None])[0], fov, cameras.sizes[view_id])
+
+    @classmethod
+    def _of(cls, position: np.ndarray, wxyz: np.ndarray, fov: float, size: np.ndarray) -> ViewerCamera:
+        (x, y, z), (a, b, c, d), (width, height) = position.tolist(), wxyz.tolist(), size.tolist()
+        return cls((x, y, z), (a, b, c, d), fov, int(width), int(height))
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """The rotation from the camera to the world, [3, 3] float64."""
+        return rotation_matrices(torch.tensor(self.wxyz, dtype=torch.float64)).numpy()
+
+    def with_at_most(self, pixels: float) -> ViewerCamera:
+        """The same view in an image of at most `pixels` pixels."""
+        scale = min(1.0, math.sqrt(pixels / (self.width * self.height)))
+        width, height = (max(SMALLEST_SIDE, int(side * scale)) for side in (self.width, self.height))
+        return replace(self, width=width, height=height)
+
+    def cameras(self, device: torch.device) -> Cameras:
+        """The camera as one of `Cameras`, float32 on a device."""
+        to_camera = self.rotation.T
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = to_camera
+        viewmat[:3, 3] = -to_camera @ np.array(self.position)
+        focal = self.height / (2.0 * math.tan(self.fov / 2.0))
+        K = np.array([[focal, 0.0, self.width / 2.0], [0.0, focal, self.height / 2.0], [0.0, 0.0, 1.0]])
+        viewmats, Ks = (torch.from_numpy(array[None]).float().to(device) for array in (viewmat, K))
+        return Cameras(viewmats, Ks, np.array([[self.width, self.height]], dtype=np.int64))
