@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from turbogs_plugin.files import write_atomically
-from turbogs_plugin.report.plots import SECONDS_LABEL, STYLE
+from turbogs_plugin.report.curves import SECONDS_LABEL, STYLE
 from turbogs_plugin.study.statistics import SceneSummary, VariantRow, mean_curve, pareto_front
 
 COLORS = ("#1f5fa8", "#d1495b", "#2e8b57", "#e08e0b", "#7a4fa3", "#17919e", "#8c5a3c", "#5c6670")
