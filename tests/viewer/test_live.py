@@ -168,21 +168,6 @@ def test_a_paused_training_goes_on_when_nobody_looks_any_more(watched, monkeypat
     assert loop.finished
 
 
-def test_after_the_training_its_model_is_shown_until_ctrl_c(watched, monkeypatch, capsys):
-    page, live, loop = watched()
-    loop.run()
-    shown = len(page.frames)
-    page.finished = lambda: None
-
-    def wait(seconds: float) -> None:
-        if len(page.frames) > shown:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(page.controls, "wait", wait)
-    live.stay()
-    assert capsys.readouterr().out == "viewer  http://nowhere  (Ctrl-C ends)\n"
-
-
 def until(reached, seconds: float = 60.0) -> None:
     ends = time.perf_counter() + seconds
     while not reached():

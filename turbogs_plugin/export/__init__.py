@@ -1,1 +1,1 @@
-"""Results of a run to hand over: models in other formats, a page to turn a model on, renders, films, refined captures."""
+"""Results of a run to hand over: models in other formats, a page to turn one on, renders, films, refined captures."""
