@@ -26,12 +26,13 @@ from torch import Tensor
 from turbogs_plugin.report.pictures import GAP
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.evaluate import Look, render_view
 from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.inputs import open_scene, resolve_device
+from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.metrics import render_view
 from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.train.saved_model import SavedModel, load_model
-from turbogs_plugin.train.start import open_scene, resolve_device
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Color, Gaussians, PixelSamples, RowUpdate, Step
 from turbogs_plugin.viewer.eye import Eye
@@ -115,7 +116,7 @@ def _render(model: SavedModel, scene: Scene, view: int) -> np.ndarray:
 
 def _overlays(model: SavedModel, scene: Scene, view: int) -> tuple[np.ndarray, dict[str, object]]:
     """[H, W, 3] uint8, error map and samples side by side; and what they are of."""
-    loop, _ = new_loop(model.config, scene, model.gaussians.device)
+    loop = new_loop(model.config, scene, model.gaussians.device)
     trainer = loop.trainer
     trainer.observer = look = EarlyLook(trainer, view)
     loop.listeners = [look]

@@ -41,13 +41,13 @@ from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.study.cell import WARMUP_ITERATIONS, scene_on, warm_up
-from turbogs_plugin.train.evaluate import evaluate
-from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.clock import WallRecord
 from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.inputs import resolve_device
+from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.run import new_loop
-from turbogs_plugin.train.start import resolve_device
+from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.train.wall import WallRecord
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 RAW_AND_ALIGNED = ("psnr", "ssim", "aligned_psnr", "aligned_ssim")
@@ -208,7 +208,7 @@ class Measurement:
         if warm:
             few = min(WARMUP_ITERATIONS[self.device.type], config.train.iterations)
             warm_up(config, scene, test, self.device, few)
-        loop, _ = new_loop(config, scene, self.device)
+        loop = new_loop(config, scene, self.device)
         loop.run()
         trainer = loop.trainer
         trainer.require_finite()

@@ -21,8 +21,8 @@ from turbogs_plugin.export.film import RATE
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.report.provenance import provenance
-from turbogs_plugin.train.folder import RunFolder
-from turbogs_plugin.train.start import resolve_device
+from turbogs_plugin.train.inputs import resolve_device
+from turbogs_plugin.train.run_files import RunFolder
 
 FILM_SECONDS = 10.0
 Result = TypeVar("Result")

@@ -21,7 +21,7 @@ from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.report import plot_process
 from turbogs_plugin.report.outputs import distinct_stems
-from turbogs_plugin.train import run, start
+from turbogs_plugin.train import inputs, run
 from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("plotted")
@@ -213,7 +213,7 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
     turbogs, capture, tmp_path, monkeypatch, out
 ):
     (tmp_path / "dangling").symlink_to("nowhere")
-    monkeypatch.setattr(start, "load_and_find", lambda *_, **__: pytest.fail("the capture was loaded"))
+    monkeypatch.setattr(inputs, "load_and_find", lambda *_, **__: pytest.fail("the capture was loaded"))
     assert_refused(turbogs("train", capture, "--out", tmp_path / out, *QUICK), out, "cannot be made", "choose")
     assert [path.name for path in tmp_path.iterdir()] == ["dangling"]
 
@@ -490,10 +490,10 @@ def test_plots_are_drawn_by_a_process_that_begins_before_photos_are_read(turbogs
         def end(self) -> bool:
             return super().end() and ends == "draws"
 
-    draw, read = plot_process.SecondsPlot.draw, start.load_and_find
+    draw, read = plot_process.SecondsPlot.draw, inputs.load_and_find
     monkeypatch.setattr(plot_process, "PlotProcess", Process)
     monkeypatch.setattr(plot_process.SecondsPlot, "draw", lambda plot: (drawn.append(plot), draw(plot)))
-    monkeypatch.setattr(start, "load_and_find", lambda *a, **b: (made.append("photos"), read(*a, **b))[1])
+    monkeypatch.setattr(inputs, "load_and_find", lambda *a, **b: (made.append("photos"), read(*a, **b))[1])
     option = "--no-report" if ends == "is not asked for" else "--report"
     code, _, err = turbogs("train", capture, "--out", tmp_path / "run", option, "--device", "cpu", *QUICK)
     assert code == 0, err

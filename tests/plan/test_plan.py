@@ -29,18 +29,14 @@ FACTS = SceneFacts(
     scene="synthetic",
     train_views=100,
     test_views=10,
-    smallest_photo=(600, 400),
     largest_photo=(900, 600),
     points=10_000,
-    extent=3.0,
-    baseline=0.1,
     exposure_spread=0.05,
     exposure_rest=0.05,
     exposure_views=100,
     direction_concentration=0.5,
     photo_bytes=100 * MIB,
     map_bytes=120 * MIB,
-    model_bytes=10 * MIB,
     device="cuda",
     device_free_bytes=1000 * MIB,
     host_free_bytes=8000 * MIB,
@@ -50,20 +46,6 @@ ALL_AUTO = tuple(f"{setting}=auto" for setting in RULES)
 
 def facts(**changes) -> SceneFacts:
     return dataclasses.replace(FACTS, **changes)
-
-
-def test_the_accuracy_of_cameras_is_told_where_it_is_known():
-    known, none = (plan_from_facts(facts(reprojection_error=error), load_config("turbogs")) for error in (0.358, None))
-    assert " 10000 points, 0.36 pixels from where photos show them (median); extent 3" in known.facts_text()
-    assert " 10000 points; extent 3" in none.facts_text()
-    assert Plan.from_json(known.to_json()) == known and Plan.from_json(none.to_json()) == none
-
-
-def test_exposures_that_could_not_be_compared_have_no_numbers():
-    compared, none = (plan_from_facts(facts(exposure_views=views), load_config("turbogs")) for views in (9, 0))
-    assert "exposures of 9 photos 0.05 stops apart and 0.05 from those before and after; " in compared.facts_text()
-    assert ", exposures could not be compared; 100 MiB of photos" in none.facts_text()
-    assert "exposures" not in plan_from_facts(facts(exposure_views=None), load_config("turbogs")).facts_text()
 
 
 def decision(setting: str, of: SceneFacts, *overrides: str):
@@ -322,12 +304,12 @@ def test_the_verb_prints_the_plan_of_a_capture(turbogs, capture):
         "train.maps_place": ["device", "auto"],
         "train.photos_place": ["device", "auto"],
     }
-    for fact in ("7 + 1 views of 48x40 pixels", "MiB free on the CPU"):
+    for fact in ("7 + 1 views of at most 48x40 pixels", "MiB free on the CPU"):
         assert fact in " ".join(out.split())
     grown = ("schedule.max_views=2", "schedule.min_views=1", "train.batch_for=auto", "--device", "cpu", "--gpus", 4)
     code, out, err = turbogs("plan", capture, *grown)
     assert code == 0 and re.search(r"train.batch_for +2 +auto +4 processes, of which a batch for 2", out)
-    assert "; 4 processes" in " ".join(out.split())
+    assert ", 4 processes" in " ".join(out.split())
     assert turbogs("plan", capture, "--gpus", 0)[0] == 2
     code, out, err = turbogs("plan", capture.parent / "absent")
     assert code == 2 and "no such scene" in err

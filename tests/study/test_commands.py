@@ -37,12 +37,12 @@ from turbogs_plugin.study.pages import changed_since
 from turbogs_plugin.study.results import CellResult, Study
 from turbogs_plugin.study.results_file import DECIMALS
 from turbogs_plugin.study.sweep import SweepOptions
-from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.clock import WallRecord
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.run import resume, train
+from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.train.wall import WallRecord
 
 SMALL = """
 title: Tiny

@@ -21,10 +21,9 @@ from turbogs_plugin.report.pictures import MASKED, strip
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.tiles import compact, pixel_table
-from turbogs_plugin.train.background import Background
-from turbogs_plugin.train.evaluate import Look, compare, evaluate, render_view
+from turbogs_plugin.train.look import Background, Look
+from turbogs_plugin.train.metrics import compare, evaluate, render_view, ssim
 from turbogs_plugin.train.run import resume, train
-from turbogs_plugin.train.ssim import ssim
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import PARAMETER_NAMES, PixelSamples, Step
 

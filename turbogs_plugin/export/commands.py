@@ -17,8 +17,8 @@ from turbogs_plugin.files import require_new_file
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.harmonics import band_energy, drop_faint_bands
 from turbogs_plugin.model.similarity import Similarity
+from turbogs_plugin.train.inputs import resolve_device
 from turbogs_plugin.train.saved_model import load_with_capture
-from turbogs_plugin.train.start import resolve_device
 from turbogs_plugin.types import Gaussians
 
 PAGE = "html"

@@ -30,8 +30,8 @@ from turbogs_plugin.report.plots import plot_against_seconds
 from turbogs_plugin.report.tables import ERRORS, errors, history_rows, number
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.study.document import CSS, Block, Heading, Paragraph, Table
-from turbogs_plugin.train.evaluate import compare
 from turbogs_plugin.train.history import Evaluation, read_history
+from turbogs_plugin.train.metrics import compare
 from turbogs_plugin.train.saved_model import SavedModel
 from turbogs_plugin.types import Cameras, Gaussians
 

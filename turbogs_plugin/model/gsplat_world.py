@@ -9,7 +9,8 @@ points of a COLMAP reconstruction in its own coordinates:
 3. The points' median becomes the origin, and their principal axes, longest first, become x, y and z.
 
 The direction of a principal axis is an accident of the linear algebra library, and versions differ in which way up they
-turn z. So there are four possible worlds, which differ by half turns; a model's pictures tell which one is its own.
+turn z. So there are four possible worlds, which differ by half turns. A model's own is the one from where the
+reconstruction's points lie nearest to its Gaussians.
 """
 
 from __future__ import annotations
@@ -18,8 +19,32 @@ import numpy as np
 
 from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.scene.poses import camera_centers
+from turbogs_plugin.types import Gaussians
 
 HALF_TURNS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
+POINTS_AT_MOST = 20_000
+"""Points of the reconstruction that a model is compared with."""
+
+
+def out_of_gsplat_world(gaussians: Gaussians, viewmats: np.ndarray, points: np.ndarray) -> Similarity | None:
+    """The change of a model from gsplat's normalised world to its capture's own coordinates; None where the cameras or
+    points determine no world.
+
+    Args:
+        gaussians: float64; rows may be not finite.
+        viewmats, points: as in `gsplat_worlds`.
+    """
+    from scipy.spatial import cKDTree
+
+    worlds = gsplat_worlds(viewmats, points)
+    means = gaussians.means.double().numpy()
+    means = means[np.isfinite(means).all(axis=1)]
+    if not worlds or not len(means):
+        return None
+    tree, some = cKDTree(means), points[:: -(-len(points) // POINTS_AT_MOST)]
+    # In the model's world, whose unit is the same in all four; the median passes over floaters and lone points.
+    apart = [np.median(tree.query(world.scale * some @ world.rotation.T + world.translation)[0]) for world in worlds]
+    return worlds[int(np.argmin(apart))].inverse()
 
 
 def gsplat_worlds(viewmats: np.ndarray, points: np.ndarray) -> list[Similarity]:
@@ -61,7 +86,7 @@ def _smallest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """[3, 3] the rotation by the smallest angle that brings one unit vector to another (Rodrigues)."""
     cosine = float(start @ end)
     if cosine < -1.0 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])  # of the y axis: half a turn
+        return np.diag([1.0, -1.0, -1.0])  # half a turn, as `end` is along the y axis
     x, y, z = np.cross(start, end)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + cross + cross @ cross / (1.0 + cosine)

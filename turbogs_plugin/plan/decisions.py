@@ -17,7 +17,7 @@ from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.caps import cap_of
 from turbogs_plugin.plan.facts import SceneFacts
-from turbogs_plugin.plan.pixels import images_per_iteration
+from turbogs_plugin.plan.memory import images_per_iteration
 from turbogs_plugin.scene.host_arrays import MEMORY_SHARE as HOST_SHARE
 
 ONE_SIDED = 0.95

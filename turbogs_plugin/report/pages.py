@@ -12,7 +12,8 @@ from turbogs_plugin.report.machine import hardware, software
 from turbogs_plugin.report.pictures import ERROR_FULL_SCALE, picture_writer, strip
 from turbogs_plugin.report.plot_process import PlotProcess, SecondsPlot
 from turbogs_plugin.report.tables import ERRORS, error_columns, errors, history_rows, number, table, views_table
-from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
+from turbogs_plugin.train.metrics import Metrics, evaluate, render_view
+from turbogs_plugin.train.perceptual import load_lpips
 from turbogs_plugin.train.session import RunSession
 
 

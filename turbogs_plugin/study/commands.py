@@ -15,7 +15,7 @@ from turbogs_plugin.study.grid import Ablation, alike_at, load_ablation
 from turbogs_plugin.study.pages import write_report
 from turbogs_plugin.study.sweep import SweepOptions, run_sweep
 from turbogs_plugin.study.workers import UNFINISHED, run_on_gpus
-from turbogs_plugin.train.start import resolve_device
+from turbogs_plugin.train.inputs import resolve_device
 
 
 def ablate(

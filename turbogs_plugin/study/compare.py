@@ -17,10 +17,9 @@ from turbogs_plugin.files import unused_name
 from turbogs_plugin.study.difference import ABSENT, compared, difference
 from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.results import CellResult, Study
-from turbogs_plugin.train.finished import finished_text
-from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.clock import WallRecord
 from turbogs_plugin.train.history import Evaluation, read_history
-from turbogs_plugin.train.wall import WallRecord
+from turbogs_plugin.train.run_files import RunFolder
 
 UNSHARED = ("scene.", "report.", "train.seed", "train.checkpoint_every", "train.evaluate_at")
 """Sections and settings in which the runs of a variant may differ: seed, photos, and what is only reported or kept."""
@@ -91,7 +90,7 @@ def _require_finished(folder: RunFolder, config: Config, last: Evaluation) -> No
         at = f"iteration {last.iteration} of {config.train.iterations}"
     else:
         before = max((share for share in config.train.evaluate_at if share < 1.0), default=0.0)
-        finished = last.train_seconds > 0.5 * (before + 1.0) * seconds or finished_text(folder, reported=False) != ""
+        finished = last.train_seconds > 0.5 * (before + 1.0) * seconds or folder.finished_text(False) != ""
         at = f"{last.train_seconds:.1f} of {seconds:g} s"
     if not finished:
         raise InputError(

@@ -28,7 +28,7 @@ from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.progress import SweepProgress
 from turbogs_plugin.study.results import CellResult, Failure, Study
-from turbogs_plugin.train.start import resolve_device
+from turbogs_plugin.train.inputs import resolve_device
 
 POLL_SECONDS = 1.0
 """Between two looks at cells that other processes train."""
