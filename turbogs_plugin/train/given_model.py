@@ -65,7 +65,7 @@ def load_given(path: str | Path, scene: Scene, world: str = "capture") -> Gaussi
     gaussians, to_capture = _read(file)
     if to_capture is None and world == "gsplat":
         points = scene.frame.restore_points(scene.points.cpu().numpy())
-        to_capture = out_of_gsplat_world(gaussians, _own_viewmats(scene), points)
+        to_capture = out_of_gsplat_world(gaussians, _own_viewmats(scene), points, scene.point_colors.cpu().numpy())
         if to_capture is None:
             raise InputError(
                 f"{file}: the cameras and points of {scene.name} do not determine gsplat's normalised world: train the "
