@@ -1,6 +1,5 @@
 """Bands of spherical harmonics that an export leaves out."""
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -126,25 +125,3 @@ def test_an_export_has_fewer_properties_and_reads_back(turbogs, finished, tmp_pa
         assert torch.equal(read.shN, whole.shN[:, : rest // 3]) and torch.equal(read.sh0, whole.sh0)
         assert torch.equal(read.means, whole.means)
     assert (tmp_path / "0.ply").stat().st_size < (tmp_path / "24.ply").stat().st_size
-
-
-def test_an_export_never_takes_the_place_of_the_runs_model(turbogs, finished):
-    before = (finished / "model.ply").read_bytes()
-    code, out, err = turbogs("export", finished, "--drop-bands", "0.5")
-    assert code == 2 and out == "" and "--drop-bands would take the place of the run's own model.ply" in err
-    assert (finished / "model.ply").read_bytes() == before
-
-
-def test_an_export_refuses_a_threshold_out_of_range(turbogs, finished, tmp_path):
-    code, out, err = turbogs("export", finished, "--out", tmp_path / "a.ply", "--drop-bands", "1.5")
-    assert code == 2 and out == "" and "--drop-bands 1.5" in err and not (tmp_path / "a.ply").exists()
-
-
-def test_bands_that_are_needed_stay(turbogs, finished, tmp_path):
-    broken = Path(shutil.copytree(finished, tmp_path / "copy"))
-    checkpoint = next((broken / "checkpoints").glob("*.pt"))
-    state = torch.load(checkpoint)
-    state["trainer"]["gaussians"]["shN"][:, -1] = 1.0
-    torch.save(state, checkpoint)
-    code, out, _ = turbogs("export", broken, "--out", tmp_path / "a.ply", "--drop-bands", "0.01")
-    assert code == 0 and "degree 2 stays" in out and rest_properties(tmp_path / "a.ply") == 24

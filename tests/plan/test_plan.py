@@ -10,7 +10,6 @@ from helpers.framework_runs import TINY, stop_after, tiny_config
 
 from turbogs_plugin.config.auto import AUTO_SETTINGS
 from turbogs_plugin.config.configuration import apply_overrides, config_names, load_config, resolve
-from turbogs_plugin.config.old_spellings import NOW, old_spelling
 from turbogs_plugin.config.yaml_text import parse_yaml
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan import Plan, SceneFacts
@@ -18,7 +17,6 @@ from turbogs_plugin.plan.decisions import RULES
 from turbogs_plugin.plan.plan import plan_from_facts
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer
 
@@ -236,53 +234,6 @@ def test_nothing_is_built_or_trained_by_what_is_left_to_a_plan(setting, capture)
     assert undecided.without_plan() == config
 
 
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("train.backdrop=maybe", ["train.backdrop", "expected true or false or auto, got 'maybe'"]),
-        ("train.sh_degree=4", ["sh_degree", "4", "0 .. 3"]),
-        ("train.iterations=keep", ["train.iterations", "expected a whole number or auto, got 'keep'"]),
-        ("train.batch_for=0", ["batch_for", "at least 1"]),
-        ("train.base_iterations=auto", ["train.base_iterations", "whole number"]),
-        ("train.epochs=0", ["epochs", "0", "above 0"]),
-        ("train.maps_place=disk", ["train.maps_place", "'device'", "'host'"]),
-        ("train.maps=host", ["did you mean 'maps_place'?"]),
-        ("density.type=auto", ["unknown density.type 'auto'"]),
-        ("loss.type=charbonnier\nloss.views: 3", ["more than one value"]),
-    ],
-)
-def test_a_value_that_cannot_be_is_named(override, words):
-    with pytest.raises(InputError) as error:
-        load_config("turbogs", [override])
-    for word in words:
-        assert word in str(error.value)
-
-
-@pytest.mark.parametrize("spelling", NOW)
-def test_a_spelling_of_an_earlier_version_is_refused_by_a_line_that_names_the_new_one(turbogs, tmp_path, spelling):
-    kind = ["density.type=mcmc"] if spelling == "density.cap_max" else []
-    setting, _, value = spelling.partition(": ")
-    with pytest.raises(InputError) as error:
-        load_config("turbogs", [*kind, f"{setting}={value or 1}"])
-    assert str(error.value) == f"{spelling} {NOW[spelling]}"
-    section, _, key = setting.partition(".")
-    file = tmp_path / "mine.yaml"
-    file.write_text(f"base: {'mcmc' if kind else 'turbogs'}\n{section}: {{{key}: {value or 1}}}\n")
-    with pytest.raises(InputError, match=rf"^{spelling} is "):
-        load_config(str(file))
-
-
-def test_the_new_names_are_settings():
-    known = {f"{section}.{key}" for section, values in load_config("mcmc").to_mapping().items() for key in values}
-    for now in NOW.values():
-        assert set(re.findall(r"(?:train|loss|schedule|optimizer|density)\.\w+", now)) <= known | {"schedule.views"}
-
-
-def test_a_setting_of_somebody_elses_strategy_is_not_ours_to_rename():
-    theirs = {"density": {"type": "their_own", "cap_max": 5}}
-    assert old_spelling(theirs) == "" and old_spelling({"density": {"type": "mcmc", "cap_max": 5}}) != ""
-
-
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"facts": {}, "decisions": []}', "{"])
 def test_a_text_that_is_no_plan_is_refused(text):
     with pytest.raises(InputError, match="plan"):
@@ -348,20 +299,3 @@ def test_a_spoiled_plan_is_named_and_a_missing_one_is_not_missed(capture, tmp_pa
     folder.plan.unlink()
     run.resume(folder.path, write_report)
     assert "holds no plan" in folder.report.read_text()
-
-
-def test_the_ablation_of_leave_outs_plans_each_cell(turbogs, capture, tmp_path):
-    """Forced both ways; where things are changes no result."""
-    variants = ["all-views", "no-ncc", "host-maps", "host-photos"]
-    options = ["--steps", 4, "--device", "cpu", "--scene", capture, "--out", tmp_path / "study"]
-    code, _, err = turbogs("ablate", "leave_out", "train.evaluate_at=[]", *options, "--only", *variants)
-    assert code == 0, err
-    cells = {cell.variant: cell for cell in StudyFolder(tmp_path / "study").read_study().results}
-    measures = ("psnr", "worst_psnr", "ssim", "l1", "num_gaussians")
-    final = {name: [getattr(cell.final, measure) for measure in measures] for name, cell in cells.items()}
-    assert set(final) == {"nothing", *variants}
-    assert final["host-maps"] == final["host-photos"] == final["nothing"]
-    assert len({final[name][0] for name in ("nothing", "all-views", "no-ncc")}) == 3
-    cell = cells["nothing"]
-    assert cell.config["train"]["maps_place"] == "device" and cell.config["optimizer"] == cell.asked["optimizer"]
-    assert cell.asked["train"]["maps_place"] == "auto", "what was asked for is kept, so that a call can go on"

@@ -85,7 +85,7 @@ def read_colors(path: Path, vertices: dict[str, np.ndarray]) -> np.ndarray | Non
     values = given.astype(np.float64)
     bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
-        raise InputError(f"{path}: the colours of {np.count_nonzero(bad)} of {len(values)} points are not finite: export it again")
+        raise InputError(f"{path}: the colours of {bad.sum()} of {len(values)} points are not finite: export it again")
     if np.issubdtype(given.dtype, np.floating):
         white = 1.0 if values.mean() <= 1.0 else 255.0
     else:
