@@ -19,7 +19,7 @@ from turbogs_plugin import __version__, cli, scene
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.export.renders import distinct_stems
 from turbogs_plugin.model.ply import load_ply
-from turbogs_plugin.train import run, start
+from turbogs_plugin.train import inputs, run
 from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("plotted")
@@ -211,7 +211,7 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
     turbogs, capture, tmp_path, monkeypatch, out
 ):
     (tmp_path / "dangling").symlink_to("nowhere")
-    monkeypatch.setattr(start, "load_and_find", lambda *_, **__: pytest.fail("the capture was loaded"))
+    monkeypatch.setattr(inputs, "load_and_find", lambda *_, **__: pytest.fail("the capture was loaded"))
     assert_refused(turbogs("train", capture, "--out", tmp_path / out, *QUICK), out, "cannot be made", "choose")
     assert [path.name for path in tmp_path.iterdir()] == ["dangling"]
 

@@ -12,14 +12,14 @@ from packaging.requirements import Requirement
 
 from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.report.provenance import hardware, missing_bytecode, software
-from turbogs_plugin.train.evaluate import LPIPS_PACKAGES
-from turbogs_plugin.train.flip import load_flip
+from turbogs_plugin.train.perceptual import LPIPS_PACKAGES, load_flip
 from turbogs_plugin.viewer.server import INSTALL as INSTALL_VIEWER
 
 REQUIREMENTS = (
     "pycolmap>=4.0",
     "filelock>=3.12",
     "scipy>=1.10",
+    "trimesh>=4.0",
     "omegaconf>=2.3",
     "tyro>=0.9",
     "rich>=13.0",

@@ -30,13 +30,13 @@ from turbogs_plugin.distributed.processes import _Watch, joined
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model import torch_file
-from turbogs_plugin.train import run, start
+from turbogs_plugin.train import inputs, run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
-from turbogs_plugin.train.evaluations import Evaluations
+from turbogs_plugin.train.clock import WallRecord
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.loop import TrainingLoop
+from turbogs_plugin.train.metrics import Evaluations
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.train.wall import WallRecord
 
 EXCHANGES = ("agree", "gather_numbers", "broadcast", "gather", "begin_gather", "_wait", "send_and_receive")
 MOMENTS = 60
@@ -140,7 +140,7 @@ def training(config: Config, out: Path, trouble: str) -> None:
         if trouble.startswith("killed at") and ranks.rank == int(trouble[-1]) % ranks.count:
             killed_at_an_exchange(random.Random(int(trouble[-1])).randrange(MOMENTS))
         if trouble == "input" and last:
-            start.load_and_find = no_capture
+            inputs.load_and_find = no_capture
         session = run.resume(out, ranks=ranks) if out.exists() else run.train(config, out, ranks=ranks)
     if session.signal:
         sys.stderr.flush()

@@ -18,7 +18,7 @@ from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.scene.photos import Photos
-from turbogs_plugin.train.evaluate import evaluate
+from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.types import BLACK, SH_C0, WHITE
 
 

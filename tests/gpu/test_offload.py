@@ -11,11 +11,11 @@ from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.error_maps import AGE_MAX
 from turbogs_plugin.plan import make_plan
+from turbogs_plugin.plan.memory import hold_to_limit, within_memory
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_views
-from turbogs_plugin.train import calibration
-from turbogs_plugin.train.evaluate import evaluate
 from turbogs_plugin.train.loop import TrainingLoop
+from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = [
@@ -125,7 +125,8 @@ def test_a_capture_larger_than_the_limit_trains_within_it():
     assert 7 * sizes > 1.5 * limit
     try:
         plan = make_plan(asked, scene, GPU)
-        config, _ = calibration.within_budget(plan.apply(asked), scene, GPU)
+        config = within_memory(plan.apply(asked), scene)
+        hold_to_limit(config, GPU)
         assert (config.train.maps_place, config.train.photos_place) == ("host", "host")
         with pytest.raises(torch.cuda.OutOfMemoryError):
             Trainer(config_of("train.maps_place=device", "train.photos_place=device").without_plan(), scene, GPU)

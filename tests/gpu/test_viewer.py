@@ -42,7 +42,7 @@ def subjects(request, tmp_path_factory) -> tuple[ModelState, ModelState]:
     places = (f"train.maps_place={request.param}", f"train.photos_place={request.param}")
     config = tiny_config(capture, "train.device=cuda", "train.iterations=8", "train.refine_until=8", *places)
     scene = load_scene(capture)
-    loop, _ = new_loop(make_plan(config, scene, CUDA).apply(config), scene, CUDA)
+    loop = new_loop(make_plan(config, scene, CUDA).apply(config), scene, CUDA)
     trainer = loop.trainer
     trainer.observer = watcher = Watcher()
     loop.run()

@@ -47,36 +47,15 @@ def scene_of(train: PosedImages, points: np.ndarray | None = None) -> Scene:
 LINE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.5, 0, 0]])
 
 
-def test_photos_of_as_many_pixels_upright_and_lying_have_two_sizes():
-    images = [noise(64, 48), noise(48, 64), noise(48, 64), noise(64, 48)]
-    facts = gather_facts(scene_of(posed(images, nadir(LINE))), CPU)
-    assert (facts.smallest_photo, facts.largest_photo) == ((48, 64), (64, 48))
-
-
 def test_counts_sizes_and_bytes():
     images = [noise(48, 64), noise(48, 80), noise(32, 64), noise(48, 64)]
-    facts = gather_facts(scene_of(posed(images, nadir(LINE))), CPU, memory_limit=5, time_budget=20.0)
+    facts = gather_facts(scene_of(posed(images, nadir(LINE))), CPU, memory_limit=5)
     pixels = 48 * 64 * 2 + 48 * 80 + 32 * 64
     assert (facts.train_views, facts.test_views, facts.points) == (4, 4, 81)
-    assert (facts.smallest_photo, facts.largest_photo) == ((64, 32), (80, 48))
-    assert (facts.photo_bytes, facts.map_bytes, facts.model_bytes) == (6 * pixels, 4 * pixels, 81 * 59 * 12)
-    assert (facts.device, facts.memory_limit, facts.time_budget) == ("cpu", 5, 20.0)
-    assert facts.extent == 5.0
+    assert facts.largest_photo == (80, 48)
+    assert (facts.photo_bytes, facts.map_bytes) == (6 * pixels, 4 * pixels)
+    assert (facts.device, facts.memory_limit) == ("cpu", 5)
     assert 0 < facts.device_free_bytes == facts.host_free_bytes
-
-
-def test_baselines_are_relative_to_depth():
-    facts = gather_facts(scene_of(posed([noise()] * 4, nadir(LINE))), CPU)
-    # Nearest cameras are 0.1, 0.1, 0.1 and 0.3 away; the points are 2 deep.
-    assert facts.baseline == pytest.approx(0.05)
-
-
-def test_points_are_looked_at_evenly_in_their_order():
-    """The first 4000 lie behind the cameras, which tell no depth."""
-    points = np.tile([0.05, 0.05, -2.0], (8000, 1))
-    points[4000:, 2] = 2.0
-    facts = gather_facts(scene_of(posed([noise()] * 4, nadir(LINE)), points), CPU)
-    assert facts.baseline == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 30.0, 90.0])
@@ -94,12 +73,11 @@ def test_points_that_no_camera_sees_decide_nothing():
     behind = np.array([[0.0, 0.0, -2.0], [50.0, 0.0, 1.0]])
     facts = gather_facts(scene_of(posed([noise()] * 4, nadir(LINE)), behind), CPU, with_exposures=True)
     assert facts.exposure_views == 0 and facts.exposure_spread == facts.exposure_rest == 0.0
-    assert facts.baseline == pytest.approx(0.1)  # of the extent instead
 
 
 def test_a_single_view_has_no_neighbour():
     facts = gather_facts(scene_of(posed([noise()], nadir(LINE[:1]))), CPU, with_exposures=True)
-    assert (facts.baseline, facts.exposure_spread, facts.direction_concentration) == (0.0, 0.0, 1.0)
+    assert (facts.exposure_spread, facts.direction_concentration) == (0.0, 1.0)
 
 
 class Work(TorchDispatchMode):
@@ -116,7 +94,7 @@ class Work(TorchDispatchMode):
 
 
 def test_the_work_is_bounded():
-    """Photos 25 times as large and ten times the points: the facts look at no more of them."""
+    """Photos 25 times as large and ten times the points: the comparison of exposures looks at no more of them."""
     centers = np.random.default_rng(0).uniform(-1, 1, (20, 3)) * [1, 1, 0]
     one = posed([noise()], nadir(centers[:1]))
 
@@ -127,14 +105,10 @@ def test_the_work_is_bounded():
         points = np.random.default_rng(1).normal(0, 1, (count, 3)) + np.array([0, 0, 4])
         scene = scene_of(PosedImages(cameras, tuple(map(str, range(20))), photos), points)
         with Work() as work:
-            gather_facts(scene, CPU)
+            gather_facts(scene, CPU, with_exposures=True)
         return work.elements
 
-    small = work(200, 20_000)
-    assert work(1000, 200_000) <= 1.1 * small
-    assert (
-        small < 20 * (64 * 256 + 400 * 25 + 2000) * 25
-    )  # so many pixels of tiles and patches, and points, a view, a few numbers of each
+    assert work(1000, 200_000) <= 1.1 * work(200, 20_000)
 
 
 def test_a_scene_without_points_has_a_plan():

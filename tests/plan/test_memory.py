@@ -10,8 +10,7 @@ from turbogs_plugin.config.configuration import load_config, resolve
 from turbogs_plugin.config.units import parse_bytes
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, cap_of, growth_room, lowered_cap, with_cap, without_growth
-from turbogs_plugin.plan.memory import MemoryDemand
-from turbogs_plugin.plan.pixels import most_images
+from turbogs_plugin.plan.memory import MemoryDemand, most_images
 
 
 @pytest.mark.parametrize("kind", ["error_driven", "mcmc", "none"])

@@ -22,11 +22,11 @@ from turbogs_plugin.report.curves import plot_against_seconds
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, GAP, depth_picture, error_picture, save_image, strip
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.report.tables import number, table
-from turbogs_plugin.train import evaluate, run
-from turbogs_plugin.train.evaluate import Metrics, ViewMetrics, compare, load_lpips, psnr
+from turbogs_plugin.train import perceptual, run
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
+from turbogs_plugin.train.metrics import Metrics, ViewMetrics, compare, psnr, ssim
+from turbogs_plugin.train.perceptual import load_lpips
 from turbogs_plugin.train.progress import TrainingProgress, describe_nonfinite
-from turbogs_plugin.train.ssim import ssim
 
 FIELDS = {"iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians", "memory_bytes"}
 
@@ -110,7 +110,7 @@ def test_lpips_says_why_it_is_missing(tmp_path, monkeypatch):
     assert function is None and reason
     with pytest.raises(InputError, match="no such file"):
         load_lpips(str(tmp_path / "absent.pth"), torch.device("cpu"))
-    monkeypatch.setattr(evaluate, "LPIPS_PACKAGES", ("torch", "no_such_package"))
+    monkeypatch.setattr(perceptual, "LPIPS_PACKAGES", ("torch", "no_such_package"))
     release = torch.__version__.partition("+")[0]
     said = f"it needs no_such_package (pip install no_such_package torch=={release}) and the weights vgg16-"
     assert load_lpips(None, torch.device("cpu"))[1].startswith(said)
@@ -130,15 +130,15 @@ def test_lpips_is_loaded_once_a_process(tmp_path, monkeypatch):
 
     module = SimpleNamespace(LearnedPerceptualImagePatchSimilarity=Network)
     monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", module)
-    monkeypatch.setattr(evaluate, "LPIPS_PACKAGES", ())
-    evaluate._lpips_network.cache_clear()
+    monkeypatch.setattr(perceptual, "LPIPS_PACKAGES", ())
+    perceptual._lpips_network.cache_clear()
     (tmp_path / "w.pth").touch()
     cache = torch.hub.get_dir()
     for _ in range(2):
         function, reason = load_lpips(str(tmp_path / "w.pth"), torch.device("cpu"))
         assert reason == "" and function(torch.ones(4, 5, 3), torch.zeros(4, 5, 3)) == 1.0
     assert len(made) == 1 and made[0] != cache == torch.hub.get_dir()
-    evaluate._lpips_network.cache_clear()
+    perceptual._lpips_network.cache_clear()
 
 
 def test_bytecode_that_is_missing_is_named_with_its_remedy(tmp_path, monkeypatch):

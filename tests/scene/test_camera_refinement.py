@@ -17,8 +17,9 @@ from turbogs_plugin.scene.bundle_adjustment import reprojection_errors
 from turbogs_plugin.scene.camera_refinement import _pinholes, load_and_find, refine_cameras
 from turbogs_plugin.study.cell import capture_digest
 from turbogs_plugin.study.results import StudyFolder
-from turbogs_plugin.train.evaluate import Look, evaluate
-from turbogs_plugin.train.start import read_scene
+from turbogs_plugin.train.inputs import read_scene
+from turbogs_plugin.train.look import Look
+from turbogs_plugin.train.metrics import evaluate
 
 CASE = tracked(points=80)
 

@@ -12,7 +12,8 @@ from PIL import Image
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.scene import Scene, load_scene, write_demo_capture
 from turbogs_plugin.scene.demo import FOCAL
-from turbogs_plugin.train.evaluate import Look, evaluate
+from turbogs_plugin.train.look import Look
+from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")

@@ -11,7 +11,8 @@ from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_views
-from turbogs_plugin.train.evaluate import Look, evaluate
+from turbogs_plugin.train.look import Look
+from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")

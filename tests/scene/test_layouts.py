@@ -18,7 +18,8 @@ from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.scene import Scene, load_scene
-from turbogs_plugin.train.evaluate import Look, evaluate
+from turbogs_plugin.train.look import Look
+from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.trainer import Trainer
 
 POINTS = np.array([[0.3, 0.0, 0.1], [-0.2, 0.25, -0.3], [0.0, -0.4, 0.35]])

@@ -20,7 +20,8 @@ from turbogs_plugin.scene.starting_points import (
     shares_with_points,
     starting_points,
 )
-from turbogs_plugin.train.evaluate import Look, evaluate
+from turbogs_plugin.train.look import Look
+from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Cameras
 

@@ -23,7 +23,7 @@ from turbogs_plugin.config.yaml_text import parse_yaml
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.gsplat_file import save_gsplat
 from turbogs_plugin.scene import Frame, load_scene
-from turbogs_plugin.train import run, start
+from turbogs_plugin.train import inputs, run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from turbogs_plugin.train.given_model import load_given
 from turbogs_plugin.train.saved_model import load_model
@@ -87,7 +87,7 @@ def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
     config = run.RunFolder(finished).read_config()
     monkeypatch.setattr(run.RunFolder, "read_config", lambda folder: copy.deepcopy(config))
     scene = load_scene(config.scene.path)
-    monkeypatch.setattr(start, "load_and_find", lambda *_, **__: (scene, None))
+    monkeypatch.setattr(inputs, "load_and_find", lambda *_, **__: (scene, None))
     state = load_checkpoint(latest_checkpoint(finished / "checkpoints"))
     (tmp_path / "run").mkdir()
     shutil.copy(finished / "config.yaml", tmp_path / "run")

@@ -23,7 +23,6 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.gsplat_file import save_gsplat
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.scene import Frame, Scene, load_scene
-from turbogs_plugin.train import given_model
 from turbogs_plugin.train.initial_state import initial_gaussians
 from turbogs_plugin.types import Gaussians
 
@@ -143,17 +142,11 @@ def scene(capture) -> Scene:
     return load_scene(capture, factor=4)
 
 
-@pytest.fixture
-def one_trial_view(monkeypatch) -> None:
-    """What a model is worth in other coordinates is no matter here, and takes longer than all else."""
-    monkeypatch.setattr(given_model, "TRIAL_VIEWS", 1)
-
-
 def started(scene: Scene, capture: Path, file: Path) -> Gaussians | InputError:
     config = tiny_config(capture, f"train.init={file}").without_plan()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of Gaussians left out, of models of another capture
-        return outcome_within(MEMORY, initial_gaussians, scene, config, str(file), CPU)
+        warnings.simplefilter("ignore")  # of Gaussians left out
+        return outcome_within(MEMORY, initial_gaussians, scene, config, str(file))
 
 
 def require_whole_model(gaussians: Gaussians) -> None:
@@ -161,7 +154,6 @@ def require_whole_model(gaussians: Gaussians) -> None:
     assert all(value.isfinite().all() for _, value in gaussians.items())
 
 
-@pytest.mark.usefixtures("one_trial_view")
 @pytest.mark.parametrize("suffix", [".ply", ".pt"])
 def test_damaged_starts(scene, capture, tmp_path, suffix):
     """Single numbers among the parameters, and bytes anywhere."""
@@ -224,6 +216,6 @@ def test_no_points(capture, photos, tmp_path, kind):
     found = load_scene(folder)
     require_whole(found)
     assert len(found.points) == 50_000 and "so 50,000 random ones" in found.notes[0]
-    gaussians = initial_gaussians(found, tiny_config(folder, "density.max_gaussians=300").without_plan(), "points", CPU)
+    gaussians = initial_gaussians(found, tiny_config(folder, "density.max_gaussians=300").without_plan(), "points")
     assert len(gaussians) == 300
     require_whole_model(gaussians)

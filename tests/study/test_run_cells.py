@@ -25,9 +25,9 @@ from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.grid import CellKey, load_ablation, variant_config
 from turbogs_plugin.study.results import StudyFolder, flat_settings
 from turbogs_plugin.study.run_cells import CellChoice, run_study
-from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.run import train
+from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.train.trainer import Trainer
 
 SMALL = """

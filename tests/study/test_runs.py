@@ -11,8 +11,8 @@ from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.results import StudyFolder
 from turbogs_plugin.study.runs import study_of_runs
+from turbogs_plugin.train.clock import WallRecord
 from turbogs_plugin.train.history import Evaluation, append_evaluation
-from turbogs_plugin.train.wall import WallRecord
 
 pytestmark = pytest.mark.usefixtures("plotted")
 

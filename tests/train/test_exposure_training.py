@@ -16,8 +16,8 @@ from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
-from turbogs_plugin.train.evaluate import align_colors, compare, evaluate, render_view
 from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.metrics import align_colors, compare, evaluate, render_view
 from turbogs_plugin.train.run import resume, train
 from turbogs_plugin.train.trainer import Trainer
 

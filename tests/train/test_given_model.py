@@ -1,9 +1,8 @@
 """Models trained anywhere: a start for training, and evaluated, rendered and exported with a capture named."""
 
+import dataclasses
 import re
 import shutil
-import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +83,7 @@ def test_a_model_is_the_same_in_every_form(finished, capture, tmp_path, recwarn)
     scene = load_scene(capture)
     trained = load_model(finished, CPU).gaussians
     for file in files_of(finished, tmp_path).values():
-        assert_alike(load_given(file, scene, CPU), trained)
+        assert_alike(load_given(file, scene), trained)
     assert not [warning for warning in recwarn if issubclass(warning.category, UserWarning)]
 
 
@@ -133,11 +132,11 @@ def test_an_export_of_a_run_reads_back(turbogs, finished, capture, tmp_path, for
     target = tmp_path / f"exported.{form}"
     code, out, _ = turbogs("export", finished, "--format", form, "--out", target)
     assert code == 0 and str(target) in out
-    assert_alike(load_given(target, load_scene(capture), CPU), load_model(finished, CPU).gaussians)
+    assert_alike(load_given(target, load_scene(capture)), load_model(finished, CPU).gaussians)
     again = tmp_path / ("again.ply" if form == "pt" else "again.pt")
     code, _, error = turbogs("export", target, "--format", again.suffix[1:], "--scene", capture, "--out", again)
     assert (code, error) == (0, "")
-    assert_alike(load_given(again, load_scene(capture), CPU), load_model(finished, CPU).gaussians)
+    assert_alike(load_given(again, load_scene(capture)), load_model(finished, CPU).gaussians)
 
 
 # Largest losses of PSNR in dB on the test view, and largest mean differences of its picture in grey levels.
@@ -167,11 +166,11 @@ def test_every_format_that_is_written_is_a_model_to_measure_and_render(turbogs, 
 
 
 @pytest.mark.parametrize("world", range(4))
-def test_gsplats_normalised_world_is_recognised(finished, capture, tmp_path, world):
+def test_a_model_of_gsplats_normalised_world_is_brought_back(finished, capture, tmp_path, world):
+    """Whichever half turn gsplat's version and linear algebra made of it."""
     theirs = worlds_of(capture)[world].apply(read_ply(finished / "model.ply"))
     file = save_splats(tmp_path / "ckpt.pt", theirs)
-    with pytest.warns(UserWarning, match=r"ckpt\.pt is in gsplat's normalised world .*: brought back"):
-        loaded = load_given(file, load_scene(capture), CPU)
+    loaded = load_given(file, load_scene(capture), "gsplat")
     trained = load_model(finished, CPU).gaussians
     for name in ("means", "scales", "opacities", "sh0", "shN"):
         torch.testing.assert_close(getattr(loaded, name), getattr(trained, name), rtol=1e-3, atol=1e-3)
@@ -179,26 +178,28 @@ def test_gsplats_normalised_world_is_recognised(finished, capture, tmp_path, wor
     torch.testing.assert_close(aligned, torch.ones_like(aligned))
 
 
-def shown(message, category, filename, lineno, file=None, line=None) -> None:
-    """As Python shows a warning where pytest does not collect it."""
-    sys.stderr.write(warnings.formatwarning(message, category, filename, lineno, line))
-
-
-def test_gsplats_normalised_world_is_said_on_one_line(turbogs, finished, capture, tmp_path, monkeypatch):
-    file = save_splats(tmp_path / "ckpt.pt", worlds_of(capture)[0].apply(read_ply(finished / "model.ply")))
-    monkeypatch.setattr(warnings, "showwarning", shown)
-    _, said, error = turbogs("eval", file, "--scene", capture, "--device", "cpu")
-    assert error.count("\n") == 1 and error.startswith(f"turbogs: warning: {file} is in gsplat's")
-    assert float(re.search(r"mean of 1\W+([\d.]+)", said)[1]) == pytest.approx(
-        float(re.search(r"mean of 1\W+([\d.]+)", turbogs("eval", finished, "--device", "cpu")[1])[1]), abs=0.05
+def test_the_world_is_said_by_a_setting_in_training_and_evaluation(turbogs, finished, capture, tmp_path):
+    file = save_splats(tmp_path / "ckpt.pt", worlds_of(capture)[2].apply(read_ply(finished / "model.ply")))
+    config = tiny_config(capture, f"train.init={file}", "train.init_world=gsplat", "train.sh_degree=1").without_plan()
+    trained = load_model(finished, CPU).gaussians
+    torch.testing.assert_close(
+        Trainer(config, load_scene(capture), CPU).gaussians.means, trained.means, atol=1e-3, rtol=0
     )
+    given = ("eval", file, "--scene", capture, "--device", "cpu")
+    wrong, right = (
+        float(re.search(r"mean of 1\W+([\d.]+)", turbogs(*given, *setting)[1])[1])
+        for setting in ((), ("train.init_world=gsplat",))
+    )
+    assert right > wrong + 1.0
+    checkpoint = latest_checkpoint(finished / "checkpoints")  # knows its frame
+    assert_alike(load_given(checkpoint, load_scene(capture), "gsplat"), trained)
 
 
-def test_a_model_of_another_capture_is_named_with_gsplats_flag(capture, tmp_path):
-    elsewhere = random_gaussians(200, sh_degree=1)
-    file = save_splats(tmp_path / "other.pt", elsewhere)
-    with pytest.warns(UserWarning, match=r"other\.pt does not fit the photos of capture: .*--no-normalize-world-space"):
-        load_given(file, load_scene(capture), CPU)
+def test_a_capture_that_determines_no_world_is_refused(finished, capture, tmp_path):
+    scene = load_scene(capture)
+    scene = dataclasses.replace(scene, points=scene.points[:3])
+    with pytest.raises(InputError, match=r"do not determine gsplat's .* --no-normalize-world-space"):
+        load_given(finished / "model.ply", scene, "gsplat")
 
 
 def test_rows_that_are_not_finite_are_left_out_and_counted_once(finished, capture, tmp_path):
@@ -208,7 +209,7 @@ def test_rows_that_are_not_finite_are_left_out_and_counted_once(finished, captur
     model.means[2, 1], model.opacities[5], model.shN[9, 0, 0] = torch.nan, torch.inf, -torch.inf
     file = save_splats(tmp_path / "ckpt.pt", model)
     with pytest.warns(UserWarning) as warned:
-        loaded = load_given(file, load_scene(capture), CPU)
+        loaded = load_given(file, load_scene(capture))
     assert [str(line.message) for line in warned] == [
         f"{file}: 3 of {len(model)} Gaussians are not finite and left out"
     ]
@@ -221,7 +222,7 @@ def test_ranks_of_one_model_are_put_together(finished, capture, tmp_path):
     first = save_splats(tmp_path / "ckpt_6999_rank0.pt", model.map(lambda value: value[:half]))
     save_splats(tmp_path / "ckpt_6999_rank1.pt", model.map(lambda value: value[half:]))
     save_splats(tmp_path / "ckpt_29999_rank1.pt", model)
-    assert_alike(load_given(first, load_scene(capture), CPU), load_model(finished, CPU).gaussians)
+    assert_alike(load_given(first, load_scene(capture)), load_model(finished, CPU).gaussians)
 
 
 # ---- Starts ------------------------------------------------------------------------------------------------------

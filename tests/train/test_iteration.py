@@ -11,7 +11,8 @@ from torch import Tensor
 
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.scene import load_scene
-from turbogs_plugin.train.evaluate import Look, evaluate, render_view
+from turbogs_plugin.train.look import Look
+from turbogs_plugin.train.metrics import evaluate, render_view
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import RowUpdate
 

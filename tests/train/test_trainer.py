@@ -31,10 +31,11 @@ from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
-from turbogs_plugin.train.evaluate import Look, render_view
 from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.inputs import read_scene
+from turbogs_plugin.train.look import Look
+from turbogs_plugin.train.metrics import render_view
 from turbogs_plugin.train.saved_model import load_model
-from turbogs_plugin.train.start import read_scene
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import LossOutput, PixelSamples, RowUpdate
 
@@ -299,7 +300,7 @@ def test_weights_of_lpips_are_found_from_another_folder(capture, tmp_path, monke
     """And where they are gone, that is said before anything is trained."""
     (tmp_path / "here").mkdir()
     (tmp_path / "here" / "w.pth").touch()
-    monkeypatch.setattr("turbogs_plugin.train.evaluate._load_lpips", lambda file, device: None)
+    monkeypatch.setattr("turbogs_plugin.train.perceptual._load_lpips", lambda file, device: None)
     with monkeypatch.context() as context:
         context.chdir(tmp_path / "here")
         stop_after(context, 5)

@@ -32,7 +32,7 @@ from turbogs_plugin.report.provenance import missing_bytecode, provenance
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.capture import FEWEST_PHOTOS
 from turbogs_plugin.study.cell import scene_on
-from turbogs_plugin.train.start import open_scene
+from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.viewer.server import require_server
 
 AGAIN = "this build, in a process of its own"

@@ -31,7 +31,7 @@ from turbogs_plugin.distributed.shared_pass import SharedScreen
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.scene import Scene, load_scene
 from turbogs_plugin.study.cell import scene_on
-from turbogs_plugin.train.start import resolve_device
+from turbogs_plugin.train.inputs import resolve_device
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians
 

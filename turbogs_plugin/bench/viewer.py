@@ -129,7 +129,7 @@ def viewer_lines(measured: dict[str, Any]) -> list[str]:
 
 
 def _train(way: str, config: Config, scene: Scene, device: torch.device) -> ViewerRun:
-    loop, _ = new_loop(config, scene, device)
+    loop = new_loop(config, scene, device)
     begin, client = _Begin(), None
     loop.listeners = [begin]
     with ExitStack() as stack:

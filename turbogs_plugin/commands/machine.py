@@ -72,7 +72,7 @@ def bench(
     from turbogs_plugin.bench.ranks import RanksBench
     from turbogs_plugin.bench.raster import RasterBench
     from turbogs_plugin.bench.step import StepBench
-    from turbogs_plugin.train.start import resolve_device
+    from turbogs_plugin.train.inputs import resolve_device
 
     times = repeats if repeats is not None else 3 if what in ("wall", "viewer") else 100
     counts = {"gaussians": gaussians, "views": views, "repeats": (times,), "size": size, "gpus": gpus}

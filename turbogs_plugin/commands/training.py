@@ -23,7 +23,7 @@ from turbogs_plugin.commands.options import (
     require_scene,
 )
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.train.wall import WallClock, process_age
+from turbogs_plugin.train.clock import WallClock, process_age
 
 if TYPE_CHECKING:
     from turbogs_plugin.train.session import RunSession
@@ -82,12 +82,11 @@ def train(
     from turbogs_plugin.report.run_report import write_report
     from turbogs_plugin.report.tensorboard import event_writers
     from turbogs_plugin.train import run
-    from turbogs_plugin.train.finished import finished_text
 
     gc.freeze()  # so that later collections pass over them
     gc.enable()
     settings = run.RunFolder(resume).read_config() if resume else options.settings(scene, overrides)
-    if resume and viewer is None and (finished := finished_text(run.RunFolder(resume), report)):
+    if resume and viewer is None and (finished := run.RunFolder(resume).finished_text(report)):
         print(finished)
         return 0
     device = settings.train.device

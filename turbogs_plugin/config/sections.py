@@ -60,6 +60,8 @@ class TrainConfig:
         init: what training starts from: ``points`` of the capture; ``random`` points, in a cube about what the cameras
             look at; or a model's file, a .ply, gsplat's .pt, a checkpoint or a run's folder. A model is taken as it is:
             all its bands are in use from the start, and `initial_opacity` and `initial_size` change nothing.
+        init_world: coordinates of a model's file: ``capture``, the capture's own, or ``gsplat``, the normalised world
+            of gsplat's example trainer. Also for a model that eval, render, export or view is given with a capture.
         sh_degree: highest degree of the spherical harmonics.
         sh_interval: iterations between two bands; the run starts with band 0, but for a model's file.
         refine_cameras: train with cameras that agree better with the points that photos show: each photo has a pose,
@@ -73,7 +75,7 @@ class TrainConfig:
         backdrop: start with a far sphere of Gaussians in the photos' mean colour behind the scene.
         exposure: learn an affine colour for each training photo, for captures whose exposure or white balance changes
             from photo to photo (`turbogs_plugin.engine.exposures`). Test photos are compared with that of the training
-            photos before and after them (`turbogs_plugin.train.interpolated_exposures`). ``auto``: where photos differ,
+            photos before and after them (`turbogs_plugin.train.look`). ``auto``: where photos differ,
             but little from those before and after them.
         dropout: share of the Gaussians that each iteration leaves out, drawn anew each time, until
             `trainer.DROPOUT_UNTIL` of the run. ``auto``: where points are a median of 0.4 pixels or more from
@@ -81,7 +83,7 @@ class TrainConfig:
         distant_size: largest standard deviation of a Gaussian beyond 2 scene extents, over its distance from the
             cameras (`restrain_distant`). 0: no bound.
         camera_clearance: a change of the set of Gaussians also removes those that stand nearer to a training camera
-            than the capture's points do (`turbogs_plugin.model.clearance`). Nothing where it has no points of its own.
+            than the capture's points do (`turbogs_plugin.model.limits`). Nothing where it has no points of its own.
         average_last: share of the iterations, at the end of the run and since the last change of the set of Gaussians,
             whose mean the model becomes (`turbogs_plugin.train.parameter_mean`). 0: it stays that of the last one.
         evaluate_at: when to evaluate, as fractions of T; the start and the end are always evaluated.
@@ -98,6 +100,7 @@ class TrainConfig:
     maps_place: Place = "auto"
     photos_place: Place = "auto"
     init: str = "points"
+    init_world: Literal["capture", "gsplat"] = "capture"
     refine_cameras: bool = False
     sh_degree: int = 3
     sh_interval: int = 1000

@@ -11,7 +11,8 @@ import torch
 
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.poses import evenly
-from turbogs_plugin.train.evaluate import Look, psnr, render_view
+from turbogs_plugin.train.look import Look
+from turbogs_plugin.train.metrics import psnr, render_view
 from turbogs_plugin.types import Gaussians
 
 MOST_VIEWS = 8

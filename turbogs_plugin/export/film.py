@@ -16,7 +16,7 @@ from turbogs_plugin.files import require_new_file, require_writable
 from turbogs_plugin.report.evaluation import open_saved
 from turbogs_plugin.report.images import to_uint8
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.evaluate import Look
+from turbogs_plugin.train.look import Look
 from turbogs_plugin.types import Cameras, Gaussians
 
 RATE = 60

@@ -17,8 +17,8 @@ from turbogs_plugin.export.html_page import html_page, page_gaussians
 from turbogs_plugin.files import require_new_file, write_text_atomically
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.similarity import Similarity
+from turbogs_plugin.train.inputs import resolve_device
 from turbogs_plugin.train.saved_model import SavedModel, load_with_capture
-from turbogs_plugin.train.start import resolve_device
 from turbogs_plugin.types import Cameras, Gaussians
 
 PAGE = "html"

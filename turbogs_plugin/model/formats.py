@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from turbogs_plugin.model.gsplat_file import read_gsplat, save_gsplat
-from turbogs_plugin.model.gsplat_formats import read_compressed_ply, read_splat, save_by_gsplat
+from turbogs_plugin.model.packed import read_compressed_ply, read_splat, save_by_gsplat
 from turbogs_plugin.model.ply import read_ply, save_ply
 from turbogs_plugin.model.spz import read_spz, save_spz
 from turbogs_plugin.model.torch_file import load_plain

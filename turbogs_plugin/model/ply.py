@@ -13,12 +13,14 @@ import torch
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError, refusal
 from turbogs_plugin.files import write_atomically
-from turbogs_plugin.model.gsplat_formats import read_compressed_ply
+from turbogs_plugin.model.packed import read_compressed_ply
 from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.ply import TYPES, read_header, read_vertices
+from turbogs_plugin.scene.ply import read_header, read_vertices
 from turbogs_plugin.types import Gaussians
 
+NUMPY_TYPES = {"float": "<f4", "double": "<f8"}
+"""Type of a property in the header -> numpy's."""
 POSITION_ERROR = 1e-6
 """Largest rounding error of exported positions that is accepted, in units of the frame's scale."""
 
@@ -51,7 +53,7 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
     if np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 > POSITION_ERROR * frame.scale:
         kinds["means"] = "double"
     # A field for each parameter, not for each property: the rows are the same, and are filled ten times as fast.
-    table = np.zeros(len(rows), dtype=[(name, TYPES[kind], (len(groups[name]),)) for name, kind in kinds.items()])
+    table = np.zeros(len(rows), dtype=[(name, NUMPY_TYPES[kind], (len(groups[name]),)) for name, kind in kinds.items()])
     for name, value in values.items():
         table[name].reshape(value.shape)[...] = value
     finite = np.logical_and.reduce([np.isfinite(table[name]).all(axis=1) for name in values])
@@ -95,8 +97,7 @@ def read_ply(path: str | Path) -> Gaussians:
     if any(line.startswith("element chunk") for line in read_header(path)[0]):
         return read_compressed_ply(path)
     vertices = read_vertices(path)
-    names = vertices.dtype.names
-    rest = sum(name.startswith("f_rest_") for name in names)
+    rest = sum(name.startswith("f_rest_") for name in vertices)
     bands = {3 * ((degree + 1) ** 2 - 1): (degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)}
     if rest not in bands:
         raise InputError(
@@ -105,22 +106,22 @@ def read_ply(path: str | Path) -> Gaussians:
         )
     groups = _property_groups(bands[rest])
     del groups["normals"]  # not part of a model
-    if missing := [name for group in groups.values() for name in group if name not in names]:
+    if missing := [name for group in groups.values() for name in group if name not in vertices]:
         raise InputError(
             f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}, as a mesh or a "
             "cloud of points does: give the .ply that a 3DGS trainer exports"
         )
-    if not len(vertices):
+    count = len(vertices["x"])
+    if not count:
         raise InputError(f"{path} holds no Gaussians: export the model again")
-    values = {
-        parameter: np.array([vertices[name] for name in group], dtype=np.float64).reshape(len(group), len(vertices)).T
-        for parameter, group in groups.items()
-    }
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in values.items()}
-    tensors["opacities"] = tensors["opacities"][:, 0]
-    tensors["sh0"] = tensors["sh0"][:, None]
-    tensors["shN"] = tensors["shN"].view(len(vertices), 3, bands[rest]).transpose(1, 2).contiguous()
-    return Gaussians(**tensors)
+    values = {parameter: torch.empty(count, len(group), dtype=torch.float64) for parameter, group in groups.items()}
+    for parameter, group in groups.items():
+        for place, name in enumerate(group):
+            values[parameter][:, place] = torch.from_numpy(vertices[name].astype(np.float64))
+    values["opacities"] = values["opacities"][:, 0]
+    values["sh0"] = values["sh0"][:, None]
+    values["shN"] = values["shN"].view(count, 3, bands[rest]).transpose(1, 2).contiguous()
+    return Gaussians(**values)
 
 
 def _property_groups(bands: int) -> dict[str, list[str]]:

@@ -1,6 +1,6 @@
-"""What a run decides by its scene and machine: facts, the settings that are ``auto``, and the plan made of both.
+"""Decisions of a run by its scene and machine: facts, the settings that are ``auto``, and the plan made of both.
 
-Beside it what runs within limits: the cap on Gaussians, pixels an iteration, memory, and time.
+Beside it the limits of a run: the cap on Gaussians, and memory.
 """
 
 from turbogs_plugin.plan.decisions import Decision

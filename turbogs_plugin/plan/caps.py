@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from turbogs_plugin.config.configuration import Config
@@ -11,15 +9,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Step
 
 FEWEST_GAUSSIANS = 1000
-"""Fewer are no model of a capture."""
-
-EXPECTED_GROWTH = 12.0
-"""Final Gaussians per initial one, before anything is known of the scene: 10 on snowmiku to 14 on caliterra."""
-
-
-def keeps_cap(config: Config) -> bool:
-    """Whether the density control has a cap to set."""
-    return "max_gaussians" in config.density
+"""Smallest number of Gaussians that can be a model of a capture."""
 
 
 def cap_of(config: Config) -> int:
@@ -33,7 +23,7 @@ def with_cap(config: Config, cap: int) -> Config:
     Raises:
         InputError: its density control keeps no cap.
     """
-    if not keeps_cap(config):
+    if "max_gaussians" not in config.density:
         kind = config.density["type"]
         raise InputError(f"density.type {kind} keeps no cap on Gaussians: use one of error_driven, mcmc, none")
     return config.changed(density={"max_gaussians": cap})
@@ -57,16 +47,6 @@ def growth_room(config: Config) -> float:
 def without_growth(config: Config) -> Config:
     """The configuration with the initial model, cut to the cap, in the place of one that grows to it."""
     return config.changed(density={"type": "none", "max_gaussians": cap_of(config)})
-
-
-def growth_cap(config: Config, initial: int) -> int:
-    """How many Gaussians there can be at the end; 0: any number. A model that does not grow has its initial number."""
-    return initial if config.density["type"] == "none" else cap_of(config)
-
-
-def expected_gaussians(initial: int, cap: int) -> float:
-    """How many there will be at the end, before anything is known of the scene. A `cap` of 0 is none."""
-    return max(initial, min(EXPECTED_GROWTH * initial, cap or math.inf))
 
 
 def require_room(model: str, count: int, cap: int, others: int) -> None:

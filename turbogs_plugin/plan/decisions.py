@@ -1,7 +1,6 @@
 """One pure function a setting that may be ``auto``: facts and configuration -> what the setting should be, and why.
 
-Every criterion is a number of the facts against a constant of this module, whose docstring says where it is from.
-Measurements are those of docs/results/sweeps.md unless they say otherwise.
+Every criterion compares a number of the facts with a constant of this module, whose docstring says where it is from.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.caps import cap_of
 from turbogs_plugin.plan.facts import SceneFacts
-from turbogs_plugin.plan.pixels import images_per_iteration
+from turbogs_plugin.plan.memory import images_per_iteration
 from turbogs_plugin.scene.host_arrays import MEMORY_SHARE as HOST_SHARE
 
 ONE_SIDED = 0.95
@@ -25,46 +24,39 @@ ONE_SIDED = 0.95
 something have .68 (snowmiku) and .83 (fox)."""
 EXPOSURE_STOPS = 0.05
 """Standard deviation of the photos' exposures, in stops, from which on each photo gets one. fox, caliterra and snowmiku
-have .17 to .19 (docs/plan.md)."""
+have .17 to .19."""
 EXPOSURE_SHARE = 0.5
-"""Share of that deviation which photos may keep from those before and after them: else nothing says what exposure a
-photo has that is not trained. The three captures have .17 to .34."""
+"""Largest share of that deviation that is left against the photos before and after: with more, nothing says what
+exposure a test photo has. The three captures have .17 to .34."""
 DROPOUT = 0.2
-"""Share of the Gaussians left out by `auto`, until 0.95 of the run: a tenth gains half to two thirds as much, and three
-tenths until 0.85 as much as this, with a tenth more Gaussians (twenty-second round)."""
+"""Share of the Gaussians left out by `auto`: .1 gains half to two thirds as much, .3 no more, with a tenth more
+Gaussians."""
 CAMERA_PIXELS = 0.4
 """Median reprojection error, in pixels, from which on cameras are inaccurate: a model then learns each photo's own
-displacement rather than the scene. By given cameras dropout gains on fox and snowmiku (.64 and .67) and loses on
-caliterra (.33), by refined ones it gains on fox alone (.48; the others have .34 and .20)."""
+displacement rather than the scene. Dropout gains at .48 to .67 (fox, snowmiku) and loses at .20 to .34."""
 DEVICE_SHARE = 0.5
-"""Share of the device's memory that photos and maps may take: the rest is for the model, its optimizer, workspaces."""
+"""Share of the device's memory for photos and maps: the rest is for the model, its optimizer, workspaces."""
 ITERATION_MS = (1.3, 4.1)
 """A whole iteration on an H200: 150 thousand Gaussians and 3 views of a megapixel; 600 thousand and 10 views."""
 LONG_RUN = 20_000
 """Iterations from which on the plan says how long that is, as nobody would expect it."""
 LONGEST = 30_000
-"""Most iterations of `auto`, 3DGS's own length, whose iterations have one photo, too. 60 epochs of 500 training views
-take as many; those of more photos would take minutes or hours that nobody has asked for. A time budget is how to ask.
-For several processes, of which each iteration has as many times the pixels, it is that much less."""
+"""Most iterations of `auto`, 3DGS's own length: 60 epochs of 500 training views. More would take minutes or hours that
+nobody has asked for; a time budget asks for them. Divided by the times that an iteration has the pixels of one
+process."""
 LARGEST_BATCH = 2
-"""Most times the batch of one process. Twice costs no error; four times costs caliterra .25 to .73 dB, the more the
-fewer iterations it has (twenty-ninth and thirtieth round)."""
+"""Most times the batch of one process. Twice costs no error; four times costs caliterra .25 to .73 dB."""
 SHORTEST_SHARE = 0.4
-"""Least share of `train.base_iterations`: with fewer iterations, however few the photos, the events of density control
-would be too close together. fox has 52 % of them with 60 epochs. For several processes, whose steps are longer by the
-root of their number, so many fewer steps go as far (thirtieth round)."""
+"""Least share of `train.base_iterations`: with fewer iterations, events of density control would be too close together.
+Several processes, whose steps are longer by the root of their number, need fewer by that root."""
 
 Value = bool | int | float | str
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the facts say about a setting.
-
-    Args:
-        value: what it should be; None where the fact was not asked for.
-        reason: with the number that decides.
-    """
+    """A setting's value by the facts, None where the fact was not asked for; and the reason, with the number that
+    decides."""
 
     value: Value | None
     reason: str
@@ -76,9 +68,9 @@ class Decision:
 
     Args:
         setting: ``section.key``.
-        value: what it is in the run.
+        value: in the run.
         made: ``auto`` by the facts, or ``set`` by the configuration.
-        reason: of the facts; for what is set, with the value that they would have led to.
+        reason: by the facts; for what is set, with the value that they would have led to.
     """
 
     setting: str
@@ -93,7 +85,7 @@ class Decision:
 
 
 def decide(setting: str, facts: SceneFacts, config: Config) -> Decision:
-    """What a setting is in a run: what the configuration says or, where that is ``auto``, what the facts say."""
+    """A setting's value in a run: by the configuration or, where that is ``auto``, by the facts."""
     present, verdict = value_of(config.to_mapping(), setting), RULES[setting](facts, config)
     if present == AUTO:
         return Decision(setting, verdict.value, "auto", verdict.reason)

@@ -1,4 +1,4 @@
-"""What a run takes of the device's memory.
+"""Device memory of a run, and the cap on Gaussians that keeps a limit of it.
 
 The peak of a run on a GPU is taken to be ``fixed + per_gaussian * N``, all of it torch's own allocations (the CUDA
 context comes on top, with its 0.3 to 0.6 GiB). With K views an iteration, degree-d harmonics (B bands above 0) and
@@ -17,35 +17,57 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.error_maps import MAP_BYTES
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS
-from turbogs_plugin.plan.pixels import most_images, most_views
+from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, growth_room, lowered_cap
+from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import SETS
 from turbogs_plugin.scene.photos import PHOTO_BYTES
+from turbogs_plugin.tiles import TILE_PIXELS
 
 VIEW_BYTES = 230
 """Bytes of a Gaussian in a view: the rasterizer's instance, radius and gradient record, and its share of the
-intersections. Measured on an H200: 213 between 150 and 600 thousand Gaussians (docs/results/h200/bench-step.json)."""
+intersections. Measured on an H200: 213 between 150 and 600 thousand Gaussians."""
 SAMPLE_BYTES = 400
 """Bytes of a sample: draw, colours, gradients, errors, masks of intersections, scratch. Measured there: 320 to 400."""
 IMAGE_BYTES = 120
 """Bytes of a pixel of a whole render."""
+WHOLE_VIEWS = ("dense",)
+"""Pixel samplers that take every pixel of a view, whatever lambda."""
+
+
+def most_views(config: Config, num_views: int) -> int:
+    """Largest K of a schedule, of a scene with this number of training views."""
+    return min(num_views, config.schedule.get("max_views", config.schedule.get("views", num_views)))
+
+
+def images_per_iteration(config: Config, num_views: int) -> float:
+    """Pixels per iteration, in images: lambda; with a pixel sampler that takes whole views the largest K."""
+    views = most_views(config, num_views)
+    if config.pixel_sampler["type"] in WHOLE_VIEWS:
+        return views
+    return min(views, config.schedule.get("pixel_budget", views))
+
+
+def most_images(config: Config, num_views: int) -> float:
+    """Largest `images_per_iteration` over K, where pixels of a tile are drawn in multiples."""
+    images, views = images_per_iteration(config, num_views), most_views(config, num_views)
+    share = config.pixel_sampler.get("multiple", 1) / TILE_PIXELS
+    if share == 1 / TILE_PIXELS or config.pixel_sampler["unit"] != "pixel":
+        return images
+    fewest = min(views, config.schedule.get("min_views", views))
+    return max(count * share * max(1, round(images / count / share)) for count in range(fewest, views + 1))
 
 
 @dataclass(frozen=True)
 class MemoryDemand:
-    """Bytes of the device at the peak of a run, as the module's text counts them: ``fixed + per_gaussian * N``.
-
-    Args:
-        per_image: of an image of samples; lambda of these are counted in `fixed`.
-    """
+    """Bytes of the device at the peak of a run: ``fixed + per_gaussian * N``."""
 
     fixed: int
     per_gaussian: int
-    per_image: int
 
     @classmethod
     def of(
@@ -55,7 +77,7 @@ class MemoryDemand:
 
         Args:
             train_sizes, test_sizes: [V, 2] (width, height) of the training photos, and of the test photos, if any.
-            photo_bytes: of a pixel of a photo.
+            photo_bytes: bytes of a photo's pixel.
         """
         train, test = train_sizes.prod(axis=1), test_sizes.prod(axis=1)
         pixels, test_pixels = int(train.sum()), int(test.sum())
@@ -66,19 +88,17 @@ class MemoryDemand:
         photos = window + SETS * largest if config.train.photos_place == "host" else pixels + test_pixels
         maps = window if config.train.maps_place == "host" else pixels
         samples = math.ceil(most_images(config, num_views) * largest)
-        bands = (config.train.sh_degree + 1) ** 2 - 1
-        numbers = 14 + 3 * bands
+        numbers = 14 + 3 * ((config.train.sh_degree + 1) ** 2 - 1)
         return cls(
             fixed=photo_bytes * photos + MAP_BYTES * maps + SAMPLE_BYTES * samples + IMAGE_BYTES * largest,
             per_gaussian=2 * (3 * 4 * numbers + 4 + 8 * 4) + VIEW_BYTES * views,
-            per_image=SAMPLE_BYTES * largest,
         )
 
     def gaussians(self, limit: int) -> int:
-        """How many fit in `limit` bytes.
+        """Number of Gaussians that fit in `limit` bytes.
 
         Raises:
-            InputError: fewer than `FEWEST_GAUSSIANS`, naming the limit that fits so many.
+            InputError: fewer than `FEWEST_GAUSSIANS`, naming the limit that fits them.
         """
         count = (limit - self.fixed) // self.per_gaussian
         if count < FEWEST_GAUSSIANS:
@@ -90,6 +110,38 @@ class MemoryDemand:
             )
         return count
 
-    def more_images(self, limit: int, gaussians: float) -> float:
-        """How much lambda may rise within `limit` bytes, beside so many Gaussians."""
-        return max(0.0, limit - self.fixed - gaussians * self.per_gaussian) / self.per_image
+
+def require_gpu_memory(device: torch.device) -> None:
+    """Raise `InputError` where the memory of a device that is no GPU is to be limited."""
+    if device.type != "cuda":
+        raise InputError("--max-memory limits the memory of a GPU, and this run would be on a CPU: leave it out")
+
+
+def hold_to_limit(config: Config, device: torch.device) -> None:
+    """Hold torch to the configuration's limit of device memory, if it has one, for the rest of the process.
+
+    Raises:
+        InputError: the device is no GPU.
+    """
+    limit = config.budget.memory_bytes()
+    if limit is not None:
+        require_gpu_memory(device)
+        total = torch.cuda.get_device_properties(device).total_memory
+        torch.cuda.set_per_process_memory_fraction(min(1.0, limit / total))
+
+
+def within_memory(config: Config, scene: Scene) -> Config:
+    """The configuration whose largest number of Gaussians fits into its limit of memory, if it has one.
+
+    Args:
+        config: the places of maps and photos are decided in it.
+
+    Raises:
+        InputError: no model fits; the message names the limit that would do.
+    """
+    limit = config.budget.memory_bytes()
+    if limit is None:
+        return config
+    sizes = (scene.train.cameras.sizes, scene.test.cameras.sizes)
+    demand = MemoryDemand.of(config, *sizes, photo_bytes=scene.train.photos.stored.shape[1])
+    return lowered_cap(config, max(1, int(demand.gaussians(limit) / growth_room(config))))

@@ -20,14 +20,13 @@ from turbogs_plugin.scene import Scene
 
 @dataclass(frozen=True)
 class Plan:
-    """Facts and decisions, in the order in which they are told."""
+    """Facts and decisions, in the order in which they are printed."""
 
     facts: SceneFacts
     decisions: tuple[Decision, ...]
 
     def apply(self, config: Config) -> Config:
-        """The configuration with everything decided. It leaves nothing to decide, so that a plan of it is this very
-        configuration."""
+        """The configuration with everything decided: a plan of it changes nothing."""
         mapping = config.to_mapping()
         for decision in self.decisions:
             section, key = decision.setting.split(".")
@@ -55,32 +54,22 @@ class Plan:
     def facts_text(self) -> str:
         """The facts in a sentence."""
         facts = self.facts
-        small, large = (f"{width}x{height}" for width, height in (facts.smallest_photo, facts.largest_photo))
-        memory = "" if facts.memory_limit is None else f", of which {mebibytes(facts.memory_limit)} may be used"
-        free = f"{mebibytes(facts.device_free_bytes)} free on the {facts.device.upper()}{memory}"
-        host = "" if facts.device == "cpu" else f", {mebibytes(facts.host_free_bytes)} on the host"
-        seconds = "" if facts.time_budget is None else f"; {facts.time_budget:g} s to train"
-        processes = "" if facts.processes == 1 else f"; {facts.processes} processes"
-        exposures = ""
-        if facts.exposure_views is not None:
-            exposures = (
-                f", exposures of {facts.exposure_views} photos {facts.exposure_spread:.2f} stops apart and "
-                f"{facts.exposure_rest:.2f} from those before and after"
-                if facts.exposure_views
-                else ", exposures could not be compared"
-            )
-        points = f"{facts.points} points"
-        if facts.reprojection_error is not None:
-            points += f", {facts.reprojection_error:.2f} pixels from where photos show them (median)"
-        return (
-            f"{facts.scene}: {facts.train_views} + {facts.test_views} views of "
-            f"{small if small == large else f'{small} to {large}'} pixels, {points}; "
-            f"extent {facts.extent:.4g}, baselines {facts.baseline:.3f} of depth, view directions concentrated to "
-            f"{facts.direction_concentration:.3f}{exposures}; "
-            f"{mebibytes(facts.photo_bytes)} of photos, "
-            f"{mebibytes(facts.map_bytes)} of maps, {mebibytes(facts.model_bytes)} of model at the start; {free}{host}"
-            f"{seconds}{processes}"
-        )
+        width, height = facts.largest_photo
+        parts = [
+            f"{facts.train_views} + {facts.test_views} views of at most {width}x{height} pixels",
+            f"{facts.points} points",
+            f"view directions concentrated to {facts.direction_concentration:.3f}",
+            f"{mebibytes(facts.photo_bytes)} of photos",
+            f"{mebibytes(facts.map_bytes)} of maps",
+            f"{mebibytes(facts.device_free_bytes)} free on the {facts.device.upper()}",
+        ]
+        if facts.memory_limit is not None:
+            parts[-1] += f", of which {mebibytes(facts.memory_limit)} may be used"
+        if facts.device != "cpu":
+            parts.append(f"{mebibytes(facts.host_free_bytes)} on the host")
+        if facts.processes > 1:
+            parts.append(f"{facts.processes} processes")
+        return f"{facts.scene}: {', '.join(parts)}"
 
     def to_json(self) -> str:
         """Read back by `from_json`."""
@@ -105,11 +94,9 @@ def make_plan(config: Config, scene: Scene, device: torch.device, processes: int
         device: where training is to be.
         processes: that will train one model together.
     """
-    limit, seconds = config.budget.memory_bytes(), config.budget.seconds()
     asked = config.train.exposure == AUTO
-    facts = gather_facts(
-        scene, device, memory_limit=limit, time_budget=seconds, processes=processes, with_exposures=asked
-    )
+    limit = config.budget.memory_bytes()
+    facts = gather_facts(scene, device, memory_limit=limit, processes=processes, with_exposures=asked)
     return plan_from_facts(facts, config)
 
 

@@ -9,11 +9,11 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.report.tables import views_table
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
-from turbogs_plugin.train.evaluate import Look, evaluate, load_lpips
-from turbogs_plugin.train.flip import load_flip
-from turbogs_plugin.train.interpolated_exposures import interpolated_exposures
+from turbogs_plugin.train.inputs import resolve_device
+from turbogs_plugin.train.look import Look, interpolated_exposures
+from turbogs_plugin.train.metrics import evaluate
+from turbogs_plugin.train.perceptual import load_flip, load_lpips
 from turbogs_plugin.train.saved_model import SavedModel, load_with_capture
-from turbogs_plugin.train.start import resolve_device
 
 
 def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> str:

@@ -11,7 +11,8 @@ from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip
 from turbogs_plugin.report.provenance import hardware, software
 from turbogs_plugin.report.tables import ERRORS, error_columns, errors, history_rows, number, table, views_table
-from turbogs_plugin.train.evaluate import Metrics, evaluate, load_lpips, render_view
+from turbogs_plugin.train.metrics import Metrics, evaluate, render_view
+from turbogs_plugin.train.perceptual import load_lpips
 from turbogs_plugin.train.session import RunSession
 
 

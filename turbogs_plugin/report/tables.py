@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from turbogs_plugin.train.evaluate import Metrics, ViewMetrics
 from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.train.metrics import Metrics, ViewMetrics
 
 ERRORS = {"psnr": "PSNR in dB", "ssim": "SSIM", "l1": "mean absolute error"}
 """Measure -> head of its column, in every table of errors. Masked pixels do not count in them."""

@@ -18,9 +18,9 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.images import strip
 from turbogs_plugin.scene import PosedImages
-from turbogs_plugin.train.evaluate import render_view
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.metrics import render_view
 from turbogs_plugin.train.session import RunSession
 
 if TYPE_CHECKING:

@@ -17,13 +17,12 @@ from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.study.results import CellResult, changes, curve_and_final, flat_settings, measured
-from turbogs_plugin.train.evaluate import evaluate, load_lpips
-from turbogs_plugin.train.evaluations import Evaluations
-from turbogs_plugin.train.flip import load_flip
+from turbogs_plugin.train.clock import WallClock
 from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.metrics import Evaluations, evaluate
+from turbogs_plugin.train.perceptual import load_flip, load_lpips
 from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.train.wall import WallClock
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
 """Iterations of warm-up: the configuration is scaled to this length and trained once before the clock starts, so that
@@ -111,7 +110,7 @@ def train_cell(
         warm_up(planned, scene, test, device)
     clock.mark("warm-up")
     memory = PeakMemory(device)
-    loop, _ = new_loop(planned, scene, device)
+    loop = new_loop(planned, scene, device)
     evaluations = Evaluations(test, lpips, lambda: memory.peak or peak_memory_bytes(device))
     loop.listeners = [evaluations, memory]  # in this order, so that the peak forgets what evaluations needed
     loop.run()

@@ -32,7 +32,7 @@ from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.results import CellResult, Failure, Study, StudyFolder, changes, flat_settings
 from turbogs_plugin.study.study_report import write_report
-from turbogs_plugin.train.start import resolve_device
+from turbogs_plugin.train.inputs import resolve_device
 
 POLL_SECONDS = 1.0
 """Time between two looks at cells that other processes train."""

@@ -80,7 +80,7 @@ def _others(folder: Path, name: str) -> list[Path]:
 
 
 def _iteration(file: Path) -> int:
-    return int(_NAME.fullmatch(file.name)[1])
+    return int(file.stem.removeprefix("iteration-"))
 
 
 def _remedy(folder: Path, name: str) -> str:

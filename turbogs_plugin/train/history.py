@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import naming, read_text, write_text_atomically
@@ -102,8 +103,9 @@ def read_history(path: Path) -> list[Evaluation]:
         if number == len(lines) and not line.rstrip("\0").endswith("}"):
             break
         try:
-            values = {name: value for name, value in json.loads(line).items() if name in names}
-            evaluations.append(Evaluation(**{name: math.nan if v is None else v for name, v in values.items()}))
+            found = ((name, value) for name, value in json.loads(line).items() if name in names)
+            values: dict[str, Any] = {name: math.nan if value is None else value for name, value in found}
+            evaluations.append(Evaluation(**values))
         except (ValueError, TypeError, AttributeError):
             raise InputError(f"'{path}' line {number} is not an evaluation: take that line out") from None
     return evaluations

@@ -1,4 +1,4 @@
-"""What training starts from: the first model, and the first exposures of the photos."""
+"""The start of training: the first model, and the first exposures of the photos."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.model.harmonics import with_degree
 from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
 from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
-from turbogs_plugin.plan.exposures import compare_exposures
-from turbogs_plugin.plan.sight import Sight
+from turbogs_plugin.plan.photo_gains import compare_exposures
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.train.given_model import load_given
@@ -26,18 +25,17 @@ def first_exposures(scene: Scene, resuming: bool, device: torch.device) -> Expos
     views = scene.train
     if resuming:
         return Exposures.identity(len(views), device)
-    gains = compare_exposures(views, Sight.of(views, scene.points)).gains  # [V, 3]
+    gains = compare_exposures(views, scene.points).gains  # [V, 3]
     return Exposures.of_gains(torch.from_numpy(gains), device)
 
 
-def initial_gaussians(scene: Scene, config: Config, init: str, device: torch.device) -> Gaussians:
+def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
     """The model that training starts from: a given one, or one of points; and a backdrop if one is wanted.
 
     If there are more points than `density.max_gaussians` allows, as many as it allows are taken, evenly in their order.
 
     Args:
         init: as `train.init`.
-        device: where a given model is tried on training views.
 
     Returns:
         On the CPU.
@@ -58,7 +56,7 @@ def initial_gaussians(scene: Scene, config: Config, init: str, device: torch.dev
         settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
         gaussians = gaussians_from_points(points[rows], colors[rows], *settings)
     else:
-        gaussians = with_degree(load_given(init, scene, device), train.sh_degree)
+        gaussians = with_degree(load_given(init, scene, train.init_world), train.sh_degree)
         require_room(init, len(gaussians), cap, backdrop_count)
     if not train.backdrop:
         return gaussians

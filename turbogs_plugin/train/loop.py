@@ -75,13 +75,13 @@ class TrainingLoop:
         clock.seconds = self.ranks.agree(clock.seconds)
         for listener in self.listeners:
             listener.begun(self)
-        pace.start(trainer.iteration, clock.seconds, len(trainer.gaussians))
+        pace.start(trainer.iteration, clock.seconds)
         while not (self.finished or self.stopped):
             mark = pace.next_mark(trainer.iteration, clock.seconds)
             self.advance(mark)
             if trainer.iteration < mark:  # stopped on the way
                 break
-            due = pace.reached(trainer.iteration, clock.seconds, len(trainer.gaussians))
+            due = pace.reached(trainer.iteration, clock.seconds)
             trainer.set_length(pace.iterations, pace.refine_until)
             if self.finished:
                 trainer.conclude()

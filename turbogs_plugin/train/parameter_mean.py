@@ -25,7 +25,7 @@ class ParameterMean:
 
     Args:
         share: of a run's iterations, at its end, that count.
-        tensors: those of the present iteration, for their layout alone. A mapping, such as gsplat's splats.
+        tensors: of the present iteration, for their layout alone. A mapping, such as gsplat's splats.
 
     Attributes:
         count: iterations that were added.
@@ -34,7 +34,8 @@ class ParameterMean:
 
     def __init__(self, share: float, tensors: Mapping[str, Tensor]) -> None:
         self.share = share
-        self._begin(tensors)
+        self.count = 0
+        self.tensors = {name: value.detach()[:0].clone() for name, value in tensors.items()}
 
     def due(self, iteration: int, total: int) -> bool:
         """Whether the parameters after so many iterations of `total` count.
@@ -47,7 +48,7 @@ class ParameterMean:
         return self._counts(iteration, total)
 
     def add(self, tensors: Mapping[str, Tensor]) -> None:
-        """Add those of one more iteration. They are copied. Where there are more or fewer rows, it begins anew."""
+        """Add the tensors of one more iteration, which are copied. Where there are more or fewer rows, begin anew."""
         if any(mean.shape != tensors[name].shape for name, mean in self.tensors.items()):
             self.restart()
         if self.count == 0:
@@ -61,7 +62,7 @@ class ParameterMean:
         """Take iterations `first` to `last` of `total` out again, which are made once more.
 
         Args:
-            tensors: those of each of these iterations, as they changed nothing.
+            tensors: as each of these iterations had them, for they changed nothing.
         """
         times = sum(self._counts(iteration, total) for iteration in range(first, last + 1))
         if times >= self.count:
@@ -78,7 +79,8 @@ class ParameterMean:
     def restart(self) -> None:
         """Begin anew: from here on the parameters are of other Gaussians."""
         if self.count:
-            self._begin(self.tensors)
+            self.count = 0
+            self.tensors = {name: mean[:0].clone() for name, mean in self.tensors.items()}
 
     @torch.no_grad()
     def overwrite(self, tensors: Mapping[str, Tensor]) -> None:
@@ -113,7 +115,3 @@ class ParameterMean:
             if mean.shape != (value if count else value[:0]).shape:
                 raise ValueError(f"the mean of {name} over {count} iterations has shape {tuple(mean.shape)}")
         self.count, self.tensors = count, tensors
-
-    def _begin(self, tensors: Mapping[str, Tensor]) -> None:
-        self.count = 0
-        self.tensors = {name: value.detach()[:0].clone() for name, value in tensors.items()}

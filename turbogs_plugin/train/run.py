@@ -17,22 +17,21 @@ from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.plan import Plan, make_plan
-from turbogs_plugin.plan.pixels import most_views
+from turbogs_plugin.plan.caps import cap_of
+from turbogs_plugin.plan.memory import hold_to_limit, most_views, within_memory
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.camera_refinement import refine_cameras
 from turbogs_plugin.scene.load import holds_photos_alone
-from turbogs_plugin.train.calibration import Calibration, budget_text, hold_to, within_budget
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
-from turbogs_plugin.train.evaluate import load_lpips
-from turbogs_plugin.train.finished import require_unfinished
-from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.clock import WallClock, WallRecord
 from turbogs_plugin.train.history import rewind_history
+from turbogs_plugin.train.inputs import open_scene, read_scene, require_possible, resolve_device, starting
 from turbogs_plugin.train.loop import TrainingLoop
-from turbogs_plugin.train.pace import pace_of
+from turbogs_plugin.train.pace import fitted_to_time, pace_of
+from turbogs_plugin.train.perceptual import load_lpips
+from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.train.session import Report, RunSession, Watch
-from turbogs_plugin.train.start import open_scene, read_scene, require_possible, resolve_device, starting
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.train.wall import WallClock, WallRecord
 from turbogs_plugin.types import Gaussians
 
 IMPORTS, CAMERAS = "interpreter and imports", "cameras of photos alone"
@@ -41,7 +40,7 @@ PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
 
 
 def plan_run(config: Config, processes: int = 1) -> Plan:
-    """The plan that `train` would make now. What the capture was taken for is printed.
+    """The plan that `train` would make now. The capture's notes are printed.
 
     Args:
         processes: that would train together.
@@ -51,36 +50,41 @@ def plan_run(config: Config, processes: int = 1) -> Plan:
     """
     require_possible(config)
     device = resolve_device(config.train.device)
-    scene = open_scene(config, training=True)
+    scene = open_scene(config)
     plan = make_plan(config, scene, device, processes)
     print("\n".join(scene.notes), file=sys.stderr)  # last, as an error is one line alone
     return plan
 
 
-def new_loop(
-    config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE
-) -> tuple[TrainingLoop, Calibration | None]:
-    """A training that has not begun, fitted to its budgets. Runs and the cells of studies both begin here.
+def new_loop(config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE) -> TrainingLoop:
+    """A training that has not begun, within its budgets. Runs and the cells of studies both begin here.
 
     Args:
-        config: nothing in it is `auto` any more (`Plan.apply`). The trainer gets it fitted to the budgets.
+        config: decided (`Plan.apply`). The trainer gets it with the cap and the iterations that keep the budgets.
         ranks: the processes that train this model together; each calls this.
 
-    Returns:
-        The loop, without listeners; and the measurements for a time budget, whose seconds the loop's clock includes.
-
     Raises:
-        InputError: a budget is too small; the message names one that would do. Or the schedule has more views an
-            iteration than a GPU takes.
+        InputError: a limit of memory is too small; the message names one that would do. Or the schedule has more views
+            an iteration than a GPU takes.
     """
     views = most_views(config, len(scene.train))
     if device.type == "cuda" and views > MAX_VIEWS:
         raise InputError(f"schedule: {views} views an iteration, and a GPU takes at most {MAX_VIEWS}: ask for fewer")
-    config, calibration = within_budget(_agreed(config, ranks), scene, device, ranks)
-    trainer = Trainer(config, scene, device, ranks=ranks)
-    pace = pace_of(config, calibration and calibration.cost)
-    seconds = calibration.seconds if calibration else 0.0
-    return TrainingLoop(trainer, pace, seconds=seconds), calibration
+    hold_to_limit(config, device)
+    config, seconds = fitted_to_time(within_memory(_agreed(config, ranks), scene), scene, device, ranks)
+    return TrainingLoop(Trainer(config, scene, device, ranks=ranks), pace_of(config), seconds=seconds)
+
+
+def budget_text(config: Config) -> str:
+    """The budgets of a run that `new_loop` has fitted to them, for a terminal; empty if there are none."""
+    parts = []
+    if cap_of(config):
+        parts.append(f"at most {cap_of(config)} Gaussians at the end")
+    if config.budget.max_memory:
+        parts.append(f"{config.budget.max_memory} of device memory")
+    if config.budget.time:
+        parts.append(f"{config.budget.time} of training: about {config.train.iterations} iterations")
+    return f"budget: {'; '.join(parts)}" if parts else ""
 
 
 def _agreed(config: Config, ranks: Ranks) -> Config:
@@ -110,7 +114,7 @@ def fit(scene: Scene | Path | str, *overrides: str, config: str = DEFAULT_CONFIG
         scene = read_scene(scene, settings)
     else:
         scene = refine_cameras(scene, settings.train.refine_cameras)
-    loop, _ = new_loop(make_plan(settings, scene, device).apply(settings), scene, device)
+    loop = new_loop(make_plan(settings, scene, device).apply(settings), scene, device)
     loop.run()
     loop.trainer.require_finite()
     return loop.trainer.gaussians
@@ -148,7 +152,7 @@ def train(
         clock.mark(CAMERAS)
         config = replace(config, scene=replace(config.scene, path=posed))
     with starting(lambda: resolve_device(config.train.device), ranks) as started:
-        scene = open_scene(config, training=True, ranks=ranks)
+        scene = open_scene(config, ranks=ranks)
         clock.mark(PHOTOS)
         device = started.result()
     clock.mark(DEVICE)
@@ -156,11 +160,11 @@ def train(
     clock.mark("plan")
     remedy = "use train.photos_place=host and train.maps_place=host, --max-gaussians or a larger --factor"
     with _fitting(scene, remedy):
-        loop, calibration = new_loop(_independent(plan.apply(config), device), scene, device, ranks)
+        loop = new_loop(_independent(plan.apply(config), device), scene, device, ranks)
         session = RunSession(folder, plan, scene, loop, clock)
     if ranks.first:
         resolved = loop.trainer.config
-        said = [*scene.notes, plan.text(), budget_text(resolved, calibration)]
+        said = [*scene.notes, plan.text(), budget_text(resolved)]
         print("\n".join(filter(None, said)), file=sys.stderr)
         folder.path.mkdir(parents=True, exist_ok=True)
         write_text_atomically(folder.plan, plan.to_json())
@@ -191,19 +195,17 @@ def resume(
     earlier = WallRecord.read(folder.wall)
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None:
-        require_unfinished(folder)
+        folder.require_unfinished()
     state = None if checkpoint is None else load_checkpoint(checkpoint)
     device = resolve_device(config.train.device, "go on with this run where there is a GPU, or see 'turbogs doctor'")
     require_writable(folder.path, f"what --resume {folder.path} writes")
     _try_lpips(config, report is not None)
     with starting(lambda: device, ranks) as started:
-        scene = open_scene(config, folder, training=True, ranks=ranks)
+        scene = open_scene(config, folder, ranks=ranks)
         clock.mark(PHOTOS)
         started.result()
     clock.mark(DEVICE)
-    limit = config.budget.memory_bytes()
-    if limit is not None:
-        hold_to(limit, device)
+    hold_to_limit(config, device)
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
         resuming = state is not None
         loop = TrainingLoop(Trainer(config, scene, device, resuming, ranks), pace_of(config))

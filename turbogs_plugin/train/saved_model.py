@@ -1,4 +1,4 @@
-"""Models to render, measure or hand over: the newest one of a run, or one that was trained anywhere."""
+"""Models to render, measure or hand over: a run's newest one, or one that was trained anywhere."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.fingerprint import frame_of_state
-from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.checkpoint import gaussians_of_state, latest_checkpoint, load_checkpoint
-from turbogs_plugin.train.evaluate import Look
-from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.given_model import load_given, require_model
-from turbogs_plugin.train.start import open_scene
+from turbogs_plugin.train.inputs import open_scene
+from turbogs_plugin.train.look import Background, Look
+from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.types import Gaussians
 
 
@@ -28,8 +27,8 @@ class SavedModel:
     """The parts of a run needed to render or export its model, or a model from a file.
 
     Args:
-        folder, iteration: of the run; None of a model from a file.
-        exposures: [V, 3, 4], those of the training photos; None where none were learnt, and of a model from a file.
+        folder, iteration: of the run; None for a model from a file.
+        exposures: [V, 3, 4] of the training photos; None where none were learnt, and for a model from a file.
     """
 
     folder: RunFolder | None
@@ -41,13 +40,13 @@ class SavedModel:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the bands in use; a file does not say, so it is all that there are."""
+        """Degree of the bands in use; all bands of a model from a file, which does not say."""
         given = self.iteration is None
         return self.gaussians.sh_degree if given else self.config.train.sh_degree_at(self.iteration)
 
     def own_look(self, views: PosedImages | None = None) -> Look:
-        """How the model's own colours are shown, beside views of its capture if there is one: on the background of
-        evaluations, without exposures."""
+        """Look of the model's own colours, on the background of evaluations and without exposures, beside views of its
+        capture if there is one."""
         transparent = views is not None and views.photos.transparent
         background = Background.of(self.config.train.background, transparent).evaluated
         return Look(self.sh_degree, self.config.raster, background)
@@ -98,7 +97,7 @@ def load_with_capture(
     if given is not None:
         require_model(path)  # before its capture is read
         scene = open_scene(given)
-        gaussians = load_given(path, scene, device).map(lambda value: value.to(device))
+        gaussians = load_given(path, scene, given.train.init_world).map(lambda value: value.to(device))
         return SavedModel(None, given, gaussians, scene.frame, None), scene, ""
     model = load_model(path, device)
     try:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
+from types import FrameType
 from typing import Any
 
 import torch
@@ -16,22 +19,51 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.checkpoint import latest_checkpoint, require_like, save_checkpoint
-from turbogs_plugin.train.evaluations import Evaluations
-from turbogs_plugin.train.folder import RunFolder
+from turbogs_plugin.train.clock import WallClock, WallRecord
 from turbogs_plugin.train.history import Evaluation, append_evaluation
-from turbogs_plugin.train.interrupts import Interrupts
 from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.metrics import Evaluations
 from turbogs_plugin.train.progress import TrainingProgress
-from turbogs_plugin.train.wall import WallClock, WallRecord
+from turbogs_plugin.train.run_files import RunFolder
 
 MODEL, CHECKPOINT = "model, after the pictures", "checkpoint, after the report"
-"""Parts of the wall time at the end in which nothing else is left to do than to wait for these files."""
-
+"""Parts of the wall time at the end, in which the run only waits for these files."""
 
 Report = Callable[["RunSession"], object]
 """Writes the report of a finished run."""
 Watch = Sequence[Callable[["RunSession"], Listener]]
 """Each is called with a run before it trains, and gives one more listener of the first process's loop."""
+
+
+class Interrupts:
+    """SIGINT and SIGTERM while training: the first asks training to stop after this iteration, a second stops at once.
+
+    Python allows handlers in the main thread alone; in others signals keep their usual effect.
+
+    Args:
+        stop: called at the first signal, with its number.
+    """
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self, stop: Callable[[int], None]) -> None:
+        self.signal: int | None = None
+        self._stop = stop
+
+    def __enter__(self) -> Interrupts:
+        handled = self.SIGNALS if threading.current_thread() is threading.main_thread() else ()
+        self._previous = {number: signal.signal(number, self._handle) for number in handled}
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.signal is not None:
+            raise KeyboardInterrupt
+        self.signal = number
+        self._stop(number)
 
 
 class RunSession(Listener):
@@ -100,7 +132,7 @@ class RunSession(Listener):
             self.wall.write(self.folder.wall)
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
-        except InputError as error:  # that an iteration shows: of a strategy of one's own, say
+        except InputError as error:  # in an iteration: from a strategy of one's own, say
             self._threads.shutdown()
             if latest_checkpoint(self.folder.checkpoints) is not None:
                 raise TrainingStopped(f"{error}; {self._last_good()}") from error

@@ -23,20 +23,17 @@ from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rendering import dense_samples, rasterize
 from turbogs_plugin.engine.rules import Dropout
 from turbogs_plugin.errors import TrainingStopped
-from turbogs_plugin.model.clearance import Clearance
-from turbogs_plugin.model.distant import RESTRAIN_EVERY, restrain_distant
+from turbogs_plugin.model.limits import RESTRAIN_EVERY, Clearance, restrain_distant
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.model.torch_file import leaves
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.checkpoint import gaussians_of_state
-from turbogs_plugin.train.evaluate import Look
 from turbogs_plugin.train.initial_state import first_exposures, initial_gaussians
-from turbogs_plugin.train.interpolated_exposures import interpolated_exposures
+from turbogs_plugin.train.look import Background, Look, interpolated_exposures
 from turbogs_plugin.train.parameter_mean import ParameterMean
-from turbogs_plugin.train.returned import require_output, require_samples
+from turbogs_plugin.train.strategy_results import require_output, require_samples
 from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
 REPEATED_AT_MOST = 32
@@ -97,7 +94,7 @@ class Trainer:
         if config.train.camera_clearance and not scene.drawn_points:
             self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)
         init = "points" if resuming else config.train.init
-        self.gaussians = initial_gaussians(scene, config, init, device).map(lambda tensor: tensor.to(device))
+        self.gaussians = initial_gaussians(scene, config, init).map(lambda tensor: tensor.to(device))
         self.view_sampler.setup(self.views.cameras, scene.extent)
         self.optimizer.setup(self.gaussians)
         self.density.setup(self.gaussians)

@@ -1,4 +1,4 @@
-"""What is refused before the cameras of photos are found, or any photo is decoded."""
+"""Input that is refused before the cameras of photos are found, or any photo is decoded."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from PIL import Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
-from turbogs_plugin.train import run, start
+from turbogs_plugin.train import run
 
 
 @pytest.fixture(autouse=True)
@@ -49,23 +49,6 @@ def test_what_needs_no_photo(capture, tmp_path, monkeypatch, overrides, words):
     with pytest.raises(InputError, match=words):
         run.train(tiny_config(capture, *overrides), tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    ("limit", "words"), [("2MiB", r"--max-memory 2MiB leaves no room .* take \d+MiB here"), ("1GiB", "")]
-)
-def test_a_limit_of_memory_is_compared_with_the_sizes_of_photos(capture, monkeypatch, limit, words):
-    """Before one is decoded: the plan's own check comes after."""
-
-    def decoded(*_):
-        raise AssertionError("photos are decoded")
-
-    monkeypatch.setattr("turbogs_plugin.scene.load.load_photos", decoded)
-    config = tiny_config(capture, f"budget.max_memory={limit}")
-    with pytest.raises(InputError if words else AssertionError, match=words or "photos are decoded"):
-        start.open_scene(config, training=True)
-    with pytest.raises(AssertionError, match="photos are decoded"):
-        start.open_scene(config)
 
 
 def test_a_plan_is_refused_as_the_run(capture):

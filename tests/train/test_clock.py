@@ -14,9 +14,10 @@ from helpers.simulated_time import SimulatedTime
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.run_report import write_report
-from turbogs_plugin.train import run, start, wall
+from turbogs_plugin.train import clock as clocks
+from turbogs_plugin.train import inputs, run
 from turbogs_plugin.train import session as sessions
-from turbogs_plugin.train.wall import WallClock, WallRecord, process_age
+from turbogs_plugin.train.clock import WallClock, WallRecord, process_age
 
 pytestmark = pytest.mark.usefixtures("plotted")
 
@@ -24,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("plotted")
 def test_a_process_is_as_old_as_the_system_says(monkeypatch):
     """Its start in ticks since boot, behind a name with brackets and spaces in it; the import's time elsewhere."""
     clock = SimulatedTime(monkeypatch)
-    monkeypatch.setattr(wall, "_IMPORTED", clock.now)
+    monkeypatch.setattr(clocks, "_IMPORTED", clock.now)
     fields = " ".join(["S", *(["0"] * 18), str(3 * os.sysconf("SC_CLK_TCK")), "0"])  # the 3rd to the 23rd
     monkeypatch.setattr(Path, "read_text", lambda *_, **__: f"12 (a) b) {fields}")
     monkeypatch.setattr(time, "clock_gettime", lambda _: 10.0)
@@ -162,7 +163,7 @@ def test_the_report_takes_the_last_evaluation(capture, tmp_path, monkeypatch):
 
 def test_cuda_that_is_absent_is_named_before_photos_are_read(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(run.torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(start, "load_and_find", lambda *_, **__: pytest.fail("photos were read"))
+    monkeypatch.setattr(inputs, "load_and_find", lambda *_, **__: pytest.fail("photos were read"))
     with pytest.raises(InputError, match="CUDA was asked for and is absent"):
         run.train(tiny_config(capture, "train.device=cuda"), tmp_path / "run")
     assert not (tmp_path / "run").exists()
@@ -173,9 +174,9 @@ def test_the_device_starts_while_photos_are_read(capture, tmp_path, monkeypatch)
     import threading
 
     meet = threading.Barrier(2, timeout=60)
-    resolve, load = run.resolve_device, start.load_and_find
+    resolve, load = run.resolve_device, inputs.load_and_find
     monkeypatch.setattr(run, "resolve_device", lambda *arguments: (meet.wait(), resolve(*arguments))[1])
-    monkeypatch.setattr(start, "load_and_find", lambda *a, **b: (meet.wait(), load(*a, **b))[1])
+    monkeypatch.setattr(inputs, "load_and_find", lambda *a, **b: (meet.wait(), load(*a, **b))[1])
     assert run.train(tiny_config(capture, "train.iterations=1"), tmp_path / "run").wall.train_seconds > 0
 
 
@@ -189,7 +190,7 @@ def test_processes_connect_their_gpus_beside_the_photos():
             met.append((device, threading.current_thread() is threading.main_thread()))
 
     device = torch.device("cpu")
-    with start.starting(lambda: device, Noting()) as started:
+    with inputs.starting(lambda: device, Noting()) as started:
         assert started.result() == device
     assert met == [(device, False)]
     ProcessRanks.meet(None, device)  # uses nothing of the processes

@@ -1,4 +1,4 @@
-"""Free space around the training cameras, in which a photo shows that nothing can be."""
+"""Limits that no training view enforces: free space around the training cameras, and the size of distant Gaussians."""
 
 from __future__ import annotations
 
@@ -11,15 +11,20 @@ from torch import Tensor
 from turbogs_plugin.types import Gaussians, RowUpdate
 
 POINTS, SHARE = 10, 0.9
-"""A camera's radius is at most this share of its distance from the nearest points: so many of them, as single ones may
-be wrong. So what a photo was taken of from near by stays."""
+"""Nearest points of a camera, several as single ones may be wrong, and the largest share of its distance from them that
+its radius may be: objects photographed from near by stay."""
 RARE = 0.002
-"""No radius is larger than the distance within which this share of the points have a camera: where a camera stands
-before a wall without points, the wall stays."""
+"""Share of the points that have a camera within the largest radius: where a camera stands before a wall without points,
+the wall stays."""
 POINTS_LOOKED_AT = 100_000
-"""Of more points so many, evenly in their order."""
+"""Points that are used at most, evenly in their order."""
 DISTANCES_AT_ONCE = 1 << 22
-"""Points times cameras: it bounds memory."""
+"""Points times cameras at a time, which bounds memory."""
+DISTANT = 2.0
+"""Gaussians farther than this from the cameras' centre, in extents, are limited. All cameras lie within one extent of
+it, so these Gaussians are at least one extent away from every camera. A nearer limit would affect the scene itself."""
+RESTRAIN_EVERY = 10
+"""Iterations between two limitations, in which a standard deviation grows by a quarter at most."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +35,8 @@ class Clearance:
     corrects.
 
     Args:
-        centers: [V, 3] of the cameras.
-        radii: [V].
+        centers: [V, 3] the cameras' places.
+        radii: [V] of the spheres.
     """
 
     centers: Tensor
@@ -43,7 +48,7 @@ class Clearance:
         """The spheres of a capture; None where it has fewer than `POINTS` points.
 
         Args:
-            points: [M, 3] that were reconstructed, on the device of `centers` [V, 3].
+            points: [M, 3] of the reconstruction, on the device of `centers` [V, 3].
         """
         if len(points) < POINTS:
             return None
@@ -75,6 +80,26 @@ class Clearance:
 
 
 def _distances(points: Tensor, centers: Tensor) -> Iterator[Tensor]:
-    """[n, V] of some points after the others. By differences: cdist takes a block of threads for each number."""
+    """[n, V] distances, part by part. By differences: cdist takes a block of threads for each number."""
     for part in points.split(max(1, DISTANCES_AT_ONCE // max(1, len(centers)))):
         yield (part[:, None] - centers).norm(dim=-1)
+
+
+@torch.no_grad()
+def restrain_distant(gaussians: Gaussians, extent: float, size: float) -> None:
+    """Limit the size of Gaussians beyond `DISTANT` extents, in place, to a share of their distance from all cameras.
+
+    A splat's size is its Gaussian's size over its depth, and its distance from the image's middle is its centre's
+    distance from the axis over the same depth. So a Gaussian beside a camera reaches the middle of the image, whatever
+    its depth and perhaps in front of everything, once its deviation is a third of its distance (splats are cut at
+    3.33). It may happen that no training view shows it.
+
+    Args:
+        gaussians: the model, with the cameras' centre as origin.
+        extent: the scene's; all cameras lie within it.
+        size: largest allowed ratio of a standard deviation to the distance from the nearest place of a camera.
+    """
+    distances = gaussians.means.norm(dim=-1, keepdim=True)  # [N, 1]
+    limits = (size * (distances - extent)).log()
+    limits = torch.where(distances > DISTANT * extent, limits, torch.inf)
+    torch.minimum(gaussians.scales, limits, out=gaussians.scales)

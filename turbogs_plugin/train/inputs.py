@@ -1,31 +1,27 @@
-"""What begins with a configuration: the device, started beside other work, and the capture."""
+"""Device and capture of a configuration, and what can be refused before a photo is decoded."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 
-from turbogs_plugin.config.auto import AUTO
-from turbogs_plugin.config.configuration import Config, resolve
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
-from turbogs_plugin.plan.memory import MemoryDemand
+from turbogs_plugin.plan.memory import require_gpu_memory
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.camera_refinement import load_and_find, with_cameras
-from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.given_model import read_given
 from turbogs_plugin.train.progress import LoadingProgress
+from turbogs_plugin.train.run_files import RunFolder
 
 
 def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs doctor'") -> torch.device:
@@ -37,7 +33,7 @@ def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs d
 
 
 def require_possible(config: Config) -> None:
-    """What can be refused before the cameras of photos are found, or any photo is decoded.
+    """Refuse what can be refused before the cameras of photos are found, or any photo is decoded.
 
     Raises:
         InputError: a device or a limit of its memory that this machine does not have; a model to start from that cannot
@@ -53,31 +49,6 @@ def require_possible(config: Config) -> None:
         require_room(train.init, len(read_given(train.init)), cap, backdrop)
     else:
         chosen_points(1, cap, backdrop)
-
-
-def require_gpu_memory(device: torch.device) -> None:
-    """Raise `InputError` where the memory of a device that is no GPU is to be limited."""
-    if device.type != "cuda":
-        raise InputError("--max-memory limits the memory of a GPU, and this run would be on a CPU: leave it out")
-
-
-def require_memory(config: Config, train_sizes: np.ndarray, test_sizes: np.ndarray) -> None:
-    """Refuse a limit of memory that leaves no room for a model, whatever the plan decides.
-
-    Args:
-        train_sizes, test_sizes: [V, 2] (width, height) of the views.
-
-    Raises:
-        InputError: as `MemoryDemand.gaussians`.
-    """
-    limit = config.budget.memory_bytes()
-    if limit is None:
-        return
-    mapping = config.to_mapping()
-    for name in ("maps_place", "photos_place"):
-        if mapping["train"][name] == AUTO:
-            mapping["train"][name] = "host"
-    MemoryDemand.of(resolve(mapping).without_plan(), train_sizes, test_sizes).gaussians(limit)
 
 
 @contextmanager
@@ -105,16 +76,15 @@ def starting(resolve: Callable[[], torch.device], ranks: Ranks = ONE) -> Iterato
         yield pool.submit(start)
 
 
-def open_scene(config: Config, folder: RunFolder | None = None, training: bool = False, ranks: Ranks = ONE) -> Scene:
+def open_scene(config: Config, folder: RunFolder | None = None, ranks: Ranks = ONE) -> Scene:
     """The capture of a configuration.
 
     Args:
-        folder: that of the run with this configuration; None if the user names the capture.
-        training: whether a model is to be trained on it, within the configuration's limit of memory.
+        folder: of the run with this configuration; None if the user names the capture.
         ranks: the processes that train together; each calls this.
 
     Raises:
-        InputError: there is no usable capture, or no room to train on it.
+        InputError: there is no usable capture.
     """
     settings = config.scene
     if folder is not None and not Path(settings.path).exists():
@@ -122,20 +92,22 @@ def open_scene(config: Config, folder: RunFolder | None = None, training: bool =
             f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
             f"in {folder.config}"
         )
-    sized = partial(require_memory, config) if training else None
-    return read_scene(settings.path, config, LoadingProgress() if ranks.first else None, sized, ranks=ranks)
+    return read_scene(settings.path, config, LoadingProgress() if ranks.first else None, ranks)
 
 
-def read_scene(path: str | Path, config: Config, *options: Any, ranks: Ranks = ONE) -> Scene:
+def read_scene(
+    path: str | Path, config: Config, progress: Callable[[int, int], None] | None = None, ranks: Ranks = ONE
+) -> Scene:
     """A capture as a configuration trains on it.
 
     Args:
-        options: `progress` and `sized` of `load_scene`.
+        progress: as of `load_scene`.
         ranks: the processes that train together; each calls this. The first one refines cameras for all: machines
             differ in their last digits, and replicas may not.
 
     Raises:
         InputError: as `load_scene`.
     """
-    scene, cameras = load_and_find(path, config.scene.factor, config.scene.test_every, *options, find=ranks.first)
+    settings = config.scene
+    scene, cameras = load_and_find(path, settings.factor, settings.test_every, progress, find=ranks.first)
     return with_cameras(scene, ranks.agree(cameras), config.train.refine_cameras)

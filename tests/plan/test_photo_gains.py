@@ -6,9 +6,8 @@ import torch
 from helpers import textured_corner
 from helpers.textured_corner import FOCAL, render_corner, viewmat
 
-from turbogs_plugin.plan import exposures, gather_facts
-from turbogs_plugin.plan.exposures import compare_exposures, fit_gains
-from turbogs_plugin.plan.sight import Sight
+from turbogs_plugin.plan import gather_facts
+from turbogs_plugin.plan.photo_gains import _comparable, compare_exposures, fit_gains
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.train.initial_state import first_exposures
@@ -57,10 +56,6 @@ def points(hidden: int = 0) -> torch.Tensor:
     return torch.from_numpy(np.concatenate([places, behind])).float()
 
 
-def measured(views: PosedImages, places: torch.Tensor) -> exposures.Exposures:
-    return compare_exposures(views, Sight.of(views, places))
-
-
 def in_stops(gains: np.ndarray) -> np.ndarray:
     stops = np.log2(gains)
     return stops - stops.mean(axis=0)
@@ -70,21 +65,21 @@ def in_stops(gains: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("hidden", [0, 500])
 def test_gains_are_recovered_to_a_few_percent(turned, hidden):
     """Though a third of the points may be hidden, and lines of photos be taken the other way round or upright."""
-    found = measured(corner(RANDOM, **turned), points(hidden))
+    found = compare_exposures(corner(RANDOM, **turned), points(hidden))
     assert found.compared.all()
     assert np.abs(2.0 ** (found.gains - in_stops(RANDOM)) - 1.0).max() < 0.05
     assert found.spread == pytest.approx(in_stops(RANDOM).std(), rel=0.05)
 
 
 def test_equal_photos_have_no_spread():
-    found = measured(corner(np.ones((VIEWS, 3))), points())
+    found = compare_exposures(corner(np.ones((VIEWS, 3))), points())
     assert found.spread < 0.01 and found.rest < 0.01
 
 
 def test_a_drift_is_told_by_the_photos_before_and_after_and_turns_are_not():
     drift = 2.0 ** np.linspace(-0.4, 0.4, VIEWS)
     turns = 2.0 ** np.where(np.arange(VIEWS) % 2, 0.25, -0.25)
-    smooth, rough = (measured(corner(np.tile(gains[:, None], 3)), points()) for gains in (drift, turns))
+    smooth, rough = (compare_exposures(corner(np.tile(gains[:, None], 3)), points()) for gains in (drift, turns))
     assert smooth.spread == pytest.approx(np.log2(drift).std(), rel=0.05)
     assert rough.spread == pytest.approx(0.25, rel=0.05)
     assert smooth.rest < 0.2 * smooth.spread and rough.rest > 1.9 * rough.spread
@@ -93,7 +88,7 @@ def test_a_drift_is_told_by_the_photos_before_and_after_and_turns_are_not():
 def test_photos_of_something_else_are_not_compared():
     seeds = (*([0] * (VIEWS - 2)), 50, 90)
     gains = np.concatenate([RANDOM[:-2], np.full((2, 3), 0.5)])
-    found = measured(corner(gains, seeds=seeds), points())
+    found = compare_exposures(corner(gains, seeds=seeds), points())
     assert found.compared.tolist() == [True] * (VIEWS - 2) + [False] * 2
     assert np.abs(found.gains[:-2] - in_stops(gains[:-2])).max() < 0.07 and not found.gains[-2:].any()
 
@@ -101,12 +96,12 @@ def test_photos_of_something_else_are_not_compared():
 def test_patches_without_texture_or_room_for_a_gain_are_left_out():
     colors = np.random.default_rng(0).uniform(0.3, 0.7, (5, 25, 3)).astype(np.float32)
     colors[1, :, 0], colors[2, :, 2], colors[3] = 1.0, 0.0, 0.5
-    assert exposures._comparable(np.arange(5), colors).points.tolist() == [0, 4]
+    assert _comparable(np.arange(5), colors).points.tolist() == [0, 4]
 
 
 def test_points_in_the_air_compare_nothing():
     away = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) + 0.5
-    assert measured(corner(RANDOM), away).compared.sum() <= 2
+    assert compare_exposures(corner(RANDOM), away).compared.sum() <= 2
 
 
 def test_the_fact_is_of_the_training_photos():
@@ -115,7 +110,7 @@ def test_the_fact_is_of_the_training_photos():
     scene = Scene("c", views, views, points(), colors, Frame(np.zeros(3), 1.0), 1.0)
     assert gather_facts(scene, torch.device("cpu")).exposure_views is None
     facts = gather_facts(scene, torch.device("cpu"), with_exposures=True)
-    found = measured(views, points())
+    found = compare_exposures(views, points())
     assert (facts.exposure_spread, facts.exposure_rest) == (found.spread, found.rest)
     assert facts.exposure_views == VIEWS and found.rest > 0.1
 

@@ -1,9 +1,9 @@
-"""What neighbours in a sequence say of a photo's exposure."""
+"""Exposures of photos, by their neighbours in a sequence."""
 
 import pytest
 import torch
 
-from turbogs_plugin.train.interpolated_exposures import exposed, interpolated_exposures
+from turbogs_plugin.train.look import exposed, interpolated_exposures
 
 NAMES = [f"{number}.jpg" for number in range(40)]
 TRAINED = [name for number, name in enumerate(NAMES) if number % 8]

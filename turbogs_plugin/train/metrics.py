@@ -1,46 +1,42 @@
-"""Test error of a model: PSNR, SSIM, mean absolute error, LPIPS and FLIP if wanted and there; and rendering speed.
+"""Test errors of a model: PSNR, SSIM, mean absolute error, LPIPS and FLIP if wanted and there; rendering speed; and
+the evaluations of a training.
 
-Where views have masks, errors are of the pixels that are not masked, and those of whole photos are given beside them.
+Where views have masks, errors are of the pixels that are not masked, and errors of whole photos are given beside them.
 Where photos have exposures of their own, a test view is shown with the exposure that is known of it, and errors of the
-model's own colours, and those after a colour alignment, are given beside.
+model's own colours, before and after a colour alignment, are given beside.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
-from pathlib import Path
-from typing import Any
+from dataclasses import asdict, dataclass, field, replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from turbogs_plugin.device import synchronize
-from turbogs_plugin.engine.rendering import RasterSettings, render_image
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.device import peak_memory_bytes, synchronize
+from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.scene import PosedImages
-from turbogs_plugin.train.flip import Flip
-from turbogs_plugin.train.history import MEASURES, FurtherErrors
-from turbogs_plugin.train.interpolated_exposures import exposed
-from turbogs_plugin.train.ssim import SSIM_SIDE, ssim
-from turbogs_plugin.types import BLACK, Color, Gaussians
+from turbogs_plugin.train.history import MEASURES, Evaluation, FurtherErrors
+from turbogs_plugin.train.look import Look
+from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.perceptual import Flip, Lpips
+from turbogs_plugin.types import Gaussians
 
 PSNR_LIMIT = 100.0
 """PSNR of an exact match, in dB."""
 
-VGG16_FILE = "vgg16-397923af.pth"
-"""The file name under which torchvision looks for the backbone of LPIPS."""
+SSIM_SIDE = 11
+"""Side of SSIM's Gaussian window; a smaller image has no SSIM."""
 
-LPIPS_PACKAGES = ("torchvision", "torchmetrics")
-"""What has the network, and LPIPS itself. Importing them takes seconds, so nothing else here uses them."""
+SSIM_SIGMA = 1.5
+"""Standard deviation of SSIM's window, in pixels."""
 
-Lpips = Callable[[Tensor, Tensor], float]
-"""LPIPS of two images [H, W, 3], 0 .. 1."""
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+"""Constants of Wang et al. 2004 for values 0 .. 1."""
 
 
 @dataclass
@@ -82,32 +78,6 @@ class Metrics:
         return math.nan if any(map(math.isnan, values)) else min(values)
 
 
-@dataclass(frozen=True)
-class Look:
-    """How a model is shown beside the photos of V views.
-
-    Args:
-        sh_degree: highest degree in use.
-        settings: those of the rasterizer.
-        background: behind the model, and behind transparent photos.
-        exposures: [V, 3, 4] of the views (`interpolated_exposures`); None: the model's own colours.
-    """
-
-    sh_degree: int
-    settings: RasterSettings
-    background: Color = BLACK
-    exposures: Tensor | None = None
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Those of rendering the model's own colours."""
-        return {"sh_degree": self.sh_degree, "settings": self.settings, "background": self.background}
-
-    def colors(self, colors: Tensor, view_id: int) -> Tensor:
-        """[H, W, 3], 0 .. 1: the model's own colours [H, W, 3], seen by a view, with its exposure."""
-        return (colors if self.exposures is None else exposed(colors, self.exposures[view_id])).clamp(0.0, 1.0)
-
-
 @torch.no_grad()
 def evaluate(
     gaussians: Gaussians,
@@ -124,13 +94,14 @@ def evaluate(
     Args:
         gaussians: the model, on the views' device.
         views: cameras and photos.
-        look: how it is shown.
+        look: how the model is shown.
         lpips: from `load_lpips`, if wanted.
-        flip: from `load_flip`, if wanted. Masked pixels are the photo's in both images that these two get.
-        aligned: give the errors of its own colours after `align_colors`, too.
-        refined: where views have refined cameras, give the errors by these, too.
+        flip: from `load_flip`, if wanted. LPIPS and FLIP see the photo's pixels where it is masked.
+        aligned: give the errors of the model's own colours after `align_colors`, too.
+        refined: where views have refined cameras, give the errors by these cameras, too.
     """
-    metrics, flips, seconds = [], [], 0.0
+    metrics: list[ViewMetrics] = []
+    seconds = 0.0
     moved = replace(views, cameras=views.refined) if refined and views.refined is not None else None
     for view_id, name in enumerate(views.names):
         synchronize(gaussians.device)
@@ -141,7 +112,7 @@ def evaluate(
         seconds += time.perf_counter() - started
         photo, mask = views.photos.image(view_id, look.background), views.mask(view_id)
         measured = compare(name, image, photo, mask)
-        further = {}
+        further: dict[str, ViewMetrics] = {}
         own = own.clamp(0.0, 1.0)
         if look.exposures is not None:
             further["own"] = compare(name, own, photo, mask)
@@ -158,10 +129,8 @@ def evaluate(
         if lpips is not None:
             measured.lpips = lpips(unmasked, photo)
         if flip is not None:
-            flips.append(flip(unmasked, photo))
+            measured.flip = flip(unmasked, photo)
         metrics.append(measured)
-    for measured, value in zip(metrics, flips, strict=False):  # no flips where it is not wanted
-        measured.flip = value.result()
     return Metrics(metrics, fps=len(metrics) / seconds)
 
 
@@ -213,52 +182,98 @@ def _unmasked(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
     return torch.where(mask[:, :, None], image, photo)
 
 
-def load_lpips(weights: str | None, device: torch.device) -> tuple[Lpips | None, str]:
-    """LPIPS (VGG16), if `LPIPS_PACKAGES` and the backbone's weights are on this machine. Nothing is downloaded.
+def ssim(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Structural similarity, the mean over all pixels and channels; borders are mirrored, as torchmetrics does.
 
     Args:
-        weights: local file with torchvision's VGG16 weights; None: torch's own cache is searched.
-        device: where to compute.
+        image, photo: [H, W, 3] float, 0 .. 1, with sides of at least `SSIM_SIDE`.
+        mask: [H, W] bool, the pixels to take the mean over; None: all.
 
     Returns:
-        The function, or None; and the reason for None.
-
-    Raises:
-        InputError: `weights` names no readable file.
+        A scalar on the images' device.
     """
-    if weights is not None and not Path(weights).is_file():
-        raise InputError(f"report.lpips_weights: no such file '{weights}'")
-    missing = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
-    if missing:
-        release = torch.__version__.partition("+")[0]  # or pip may bring another torch with torchvision
-        return None, (
-            f"it needs {' and '.join(missing)} (pip install {' '.join(missing)} torch=={release}) and the weights "
-            f"{VGG16_FILE}"
+    x, y = (picture.permute(2, 0, 1) for picture in (image, photo))  # [3, H, W]
+    mean_x, mean_y, xx, yy, xy = _blurred(torch.stack((x, y, x * x, y * y, x * y)))
+    variances = (xx - mean_x.square()).clamp(min=0.0) + (yy - mean_y.square()).clamp(min=0.0)
+    covariance = xy - mean_x * mean_y
+    similar_means = (2.0 * mean_x * mean_y + SSIM_C1) / (mean_x.square() + mean_y.square() + SSIM_C1)
+    similarity = similar_means * (2.0 * covariance + SSIM_C2) / (variances + SSIM_C2)  # [3, H, W]
+    return similarity.mean() if mask is None else similarity[:, mask].mean()
+
+
+def _blurred(images: Tensor) -> Tensor:
+    """[B, 3, H, W] images under the window, which is a product: down the columns first, then along the rows.
+
+    Shifted sums, not a convolution: these need no library that is loaded for them.
+    """
+    margin = SSIM_SIDE // 2
+    weights = [math.exp(-0.5 * (place / SSIM_SIGMA) ** 2) for place in range(-margin, margin + 1)]
+    padded = F.pad(images, (margin,) * 4, mode="reflect")
+    for axis in (2, 3):
+        size = images.shape[axis]
+        blurred = padded.narrow(axis, 0, size) * (weights[0] / sum(weights))
+        for place in range(1, SSIM_SIDE):
+            blurred.add_(padded.narrow(axis, place, size), alpha=weights[place] / sum(weights))
+        padded = blurred
+    return padded
+
+
+@dataclass
+class Evaluations(Listener):
+    """Evaluates the model and passes the result to all listeners.
+
+    Args:
+        test: the test views, on the trainer's device.
+        lpips: from `load_lpips`, for the evaluation at the end; None: no LPIPS.
+        peak_memory: gives the bytes to record; None: the peak of the process so far.
+
+    Attributes:
+        history: every evaluation.
+        metrics: errors of the newest one.
+    """
+
+    test: PosedImages
+    lpips: Lpips | None = None
+    peak_memory: Callable[[], int] | None = None
+    history: list[Evaluation] = field(default_factory=list, init=False)
+    metrics: Metrics | None = field(default=None, init=False)
+
+    def metrics_at(self, iteration: int) -> Metrics | None:
+        """Errors of this process's newest evaluation, if it was made at this iteration; None otherwise."""
+        return self.metrics if self.history and self.history[-1].iteration == iteration else None
+
+    def begun(self, loop: TrainingLoop) -> None:
+        if not self.history:
+            self.evaluation_due(loop)
+
+    def evaluation_due(self, loop: TrainingLoop) -> None:
+        for listener in loop.listeners:
+            listener.evaluating(loop)
+        trainer = loop.trainer
+        trainer.require_finite()
+        metrics = evaluate(
+            trainer.gaussians,
+            self.test,
+            trainer.look(self.test.names),
+            lpips=self.lpips if loop.finished else None,
+            aligned=trainer.exposures is not None,
+            refined=loop.finished,
         )
-    file = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / VGG16_FILE
-    if not file.is_file():
-        return None, f"its weights are not on this machine; name a local {VGG16_FILE} in report.lpips_weights"
-    return _load_lpips(file, device), ""
-
-
-def _load_lpips(file: Path, device: torch.device) -> Lpips:
-    network = _lpips_network(file.resolve()).to(device)
-    return lambda image, photo: network(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]).item()
-
-
-@lru_cache(maxsize=1)
-def _lpips_network(file: Path) -> torch.nn.Module:
-    """On the CPU until it is used. A run loads it before it trains, to try it, and uses it for its report."""
-    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-
-    cache = torch.hub.get_dir()
-    with tempfile.TemporaryDirectory() as folder:  # torchvision loads the file only from a cache
-        (Path(folder) / "checkpoints").mkdir()
-        (Path(folder) / "checkpoints" / VGG16_FILE).symlink_to(file)
-        torch.hub.set_dir(folder)
-        try:
-            return LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True)
-        except (RuntimeError, OSError, KeyError, EOFError) as error:
-            raise InputError(f"report.lpips_weights: '{file}' does not hold VGG16's weights: {error}") from None
-        finally:
-            torch.hub.set_dir(cache)
+        mean = metrics.mean
+        evaluation = Evaluation(
+            iteration=trainer.iteration,
+            train_seconds=loop.clock.seconds,
+            psnr=mean.psnr,
+            ssim=mean.ssim,
+            l1=mean.l1,
+            num_gaussians=len(trainer.gaussians),
+            memory_bytes=self.peak_memory() if self.peak_memory else peak_memory_bytes(trainer.device),
+            nonfinite_losses=int(trainer.nonfinite_losses),
+            skipped_updates=int(trainer.optimizer.skipped),
+            worst_psnr=metrics.worst_psnr,
+            **mean.further(),
+        )
+        self.history.append(evaluation)
+        self.metrics = metrics
+        for listener in loop.listeners:
+            listener.evaluated(loop, evaluation)

@@ -1,4 +1,4 @@
-"""The files of a run on the disk."""
+"""The files of a run on the disk, and whether the run is finished."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from turbogs_plugin.config.yaml_text import read_yaml
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable
 from turbogs_plugin.plan import Plan
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 
 
 class RunFolder:
@@ -17,7 +18,7 @@ class RunFolder:
 
     Attributes:
         asked: the configuration as the user asked for it.
-        config: the resolved one, after plan and budgets.
+        config: the resolved configuration, after plan and budgets.
         wall: the `WallRecord`.
         tensorboard: folder of event files, where they are asked for.
     """
@@ -46,8 +47,35 @@ class RunFolder:
             raise InputError(f"--out '{self.path}' is not empty: choose a new folder")
         require_writable(self.path, f"--out '{self.path}'")
 
+    def require_unfinished(self) -> None:
+        """Raise `InputError` where a run has its model but no checkpoint: training anew would replace its history."""
+        if self.model.is_file():
+            raise InputError(
+                f"'{self.path}' is finished, for its {self.model.name} is there, and has no checkpoint to go on from: "
+                "use that model, or train anew with another --out"
+            )
+
+    def finished_text(self, reported: bool) -> str:
+        """``RUN is finished: N of N iterations`` where nothing of a run is left to do, else "".
+
+        Args:
+            reported: whether its report is asked for.
+        """
+        if not self.model.is_file() or (reported and not self.report.is_file()):
+            return ""
+        config, checkpoint = self.read_config(), latest_checkpoint(self.checkpoints)
+        if checkpoint is None:
+            return ""
+        state = load_checkpoint(checkpoint)
+        try:
+            iteration = state["trainer"]["iteration"]
+            total = state["pace"].get("iterations", config.train.iterations)  # of a time budget, the pace knows better
+            return f"{self.path} is finished: {iteration} of {total} iterations" if iteration >= total else ""
+        except (KeyError, TypeError, AttributeError):
+            return ""  # a resume from this checkpoint says what is wrong with it
+
     def discard(self) -> None:
-        """Take back what a run wrote that never came to a checkpoint, and the folder if nothing else is in it."""
+        """Remove what a run wrote that never came to a checkpoint, and the folder if nothing else is in it."""
         for path in (self.asked, self.config, self.plan, self.history, self.wall):
             path.unlink(missing_ok=True)
         if self.path.is_dir() and not any(self.path.iterdir()):

@@ -1,4 +1,4 @@
-"""What a strategy returned, looked at where a mistake can still be named: a class of one's own may return anything."""
+"""Checks of what a strategy returned, where a mistake can still be named: a class of one's own may return anything."""
 
 from __future__ import annotations
 
@@ -12,14 +12,12 @@ from turbogs_plugin.types import LossOutput, PixelSamples
 
 
 def require_samples(samples: Any, view_ids: Sequence[int], name: str) -> None:
-    """Refuse what is no `PixelSamples` of these views, in this order.
+    """Raise `InputError` unless `samples` are `PixelSamples` of these views, in this order: photos and error maps of
+    other views would be compared with the renders of these.
 
     Args:
-        view_ids: K training views that were asked for.
+        view_ids: [K] training views that were asked for.
         name: type of the pixel sampler.
-
-    Raises:
-        InputError: photos and error maps of other views would be compared with the renders of these.
     """
     if not isinstance(samples, PixelSamples):
         raise InputError(f"pixel_sampler.type '{name}' returned {_described(samples)}, not PixelSamples")
@@ -31,13 +29,10 @@ def require_samples(samples: Any, view_ids: Sequence[int], name: str) -> None:
 
 
 def require_output(output: Any, colors: Tensor, name: str) -> None:
-    """Refuse what is no `LossOutput` for these colours [P, 3].
+    """Raise `InputError` unless `output` is a `LossOutput` for these colours [P, 3], with tensors of its shapes.
 
     Args:
         name: type of the loss.
-
-    Raises:
-        InputError: another type, or a tensor of another shape.
     """
     if not isinstance(output, LossOutput):
         raise InputError(f"loss.type '{name}' returned {_described(output)}, not a LossOutput")

@@ -1,10 +1,10 @@
 """How much brighter or darker each photo is than the others: a gain a photo and channel, from what neighbours share.
 
-Neighbours show the same surface points. Which of these points both photos really show (none of them is hidden) is told
-by their surroundings, a patch of 5x5 pixels: its correlation with that of the other photo does not depend on gains. The
-median ratio of the patches' mean colours is the ratio of two gains; the gains that fit all these ratios best, in the
-sense of least absolute errors, are those of the photos. So differences are seen that build up from photo to photo, and
-those between flight lines, although the nearest photo is always one of the same line.
+Neighbours show the same surface points. Whether both photos really show a point (it is hidden in neither) is told by
+its surroundings, a patch of 5x5 pixels: its correlation with the other photo's patch does not depend on gains. The
+median ratio of the patches' mean colours is the ratio of two gains; the photos' gains are those that fit all ratios
+best, in the sense of least absolute errors. So differences show that build up from photo to photo, and between flight
+lines, although the nearest photo is always one of the same line.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from turbogs_plugin.plan.sight import Sight
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.sequence import PhotoOrder
 
+POINTS_AT_MOST = 2000
+"""3D points examined."""
 NEIGHBOURS, CANDIDATES = 8, 24
-"""A photo is compared with so many of the cameras nearest to it, of so many that are tried."""
+"""Cameras that a photo is compared with, and nearest cameras among which they are sought."""
 RADIUS = 2
-"""Of a patch, in steps."""
+"""Radius of a patch, in steps."""
 STEPS = 600
 """A patch's step is a pixel, or this part of the photo's longer side where that is more."""
 LIKENESS = 0.85
@@ -31,7 +32,7 @@ LIKENESS = 0.85
 FEWEST_MATCHES = 8
 """Patches in common from which on two photos are compared."""
 TIMES_CHANCE = 3
-"""Photos are compared if so many times more patches are alike than patches of different points."""
+"""Factor by which like patches must outnumber like patches of different points."""
 TEXTURE = 0.01
 """Standard deviation of luminance (0 .. 1) below which a patch looks like any other."""
 DARKEST, BRIGHTEST = 0.02, 0.98
@@ -40,7 +41,7 @@ PATCHES_OF_A_PHOTO, PATCHES_AT_MOST = 400, 200_000
 """Patches examined, about: of a photo in the mean, and of all photos."""
 LUMINANCE = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 ROUNDS, SMALLEST_RESIDUAL = 10, 0.01
-"""Of reweighted least squares, and the residual in stops below which all pairs weigh the same."""
+"""Rounds of reweighted least squares, and the residual in stops below which all pairs weigh the same."""
 SOLVER_STEPS, SOLVED = 1000, 1e-6
 
 Floats = NDArray[np.floating]
@@ -48,8 +49,8 @@ Integers = NDArray[np.integer]
 
 
 @dataclass(frozen=True)
-class Exposures:
-    """Of V photos, in stops: factors of 2 of their values, which are gamma-coded as in the file.
+class PhotoGains:
+    """Gains of V photos, in stops: factors of 2 of their values, which are gamma-coded as in the file.
 
     Args:
         gains: [V, 3] float64 of the channels; their mean over what is compared is 0.
@@ -75,7 +76,7 @@ class Exposures:
 
 @dataclass(frozen=True)
 class _Patches:
-    """Of one photo, those that can be compared.
+    """Patches of one photo that can be compared.
 
     Args:
         points: [n] int64, ascending.
@@ -88,15 +89,21 @@ class _Patches:
     stops: Floats
 
 
-def compare_exposures(views: PosedImages, sight: Sight) -> Exposures:
-    """The gains of photos whose points are in sight.
+def compare_exposures(views: PosedImages, points: Tensor) -> PhotoGains:
+    """The gains of photos, by the surface points that they share.
 
-    Where the points are not those of surfaces (random ones, for want of better), hardly a patch has a match and hardly
-    a photo is compared.
+    Where the points are not on surfaces (random ones, for want of better), hardly a patch has a match and hardly a
+    photo is compared.
+
+    Args:
+        points: [M, 3], in the views' frame.
     """
     count = len(views)
-    patches = _patches(views, sight)
-    order = sight.distances.topk(min(CANDIDATES, count - 1), largest=False).indices.tolist() if count > 1 else [[]]
+    cameras = views.cameras.to("cpu", torch.float64)
+    patches = _patches(views, points)
+    distances = torch.cdist(cameras.centers, cameras.centers, compute_mode="donot_use_mm_for_euclid_dist")
+    distances.fill_diagonal_(torch.inf)
+    order = distances.topk(min(CANDIDATES, count - 1), largest=False).indices.tolist() if count > 1 else [[]]
     ratios: dict[tuple[int, int], tuple[Floats, int]] = {}
     for view, nearest in enumerate(order):
         found = 0
@@ -116,7 +123,7 @@ def compare_exposures(views: PosedImages, sight: Sight) -> Exposures:
     left = gains.copy()
     near = PhotoOrder(views.names).neighbours(names, names)
     left[compared] -= near.mean(torch.from_numpy(gains[compared])).numpy()
-    return Exposures(gains, left, compared)
+    return PhotoGains(gains, left, compared)
 
 
 def fit_gains(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> Floats:
@@ -139,7 +146,7 @@ def fit_gains(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> F
 
 
 def _least_squares(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> Floats:
-    """[V, 3] of the normal equations, a graph's Laplacian, by conjugate gradients: from 0 on, means stay 0."""
+    """[V, 3] solution of the normal equations, a graph's Laplacian, by conjugate gradients: from 0 on, means stay 0."""
 
     def towards(differences: Floats) -> Floats:
         weighted = weights[:, None] * differences
@@ -168,7 +175,7 @@ def _summed(pairs: Integers, values: Floats, count: int) -> Floats:
 
 
 def _compare(first: _Patches, second: _Patches) -> tuple[Floats, int]:
-    """[3] the median of first over second, in stops, and of how many patches that is; 0 where it is too few."""
+    """[3] median of first over second, in stops, and the number of patches behind it; 0 where these are too few."""
     _, here, there = np.intersect1d(first.points, second.points, assume_unique=True, return_indices=True)
     ours, others = first.shapes[here], second.shapes[there]
     alike = _alike(ours, others)
@@ -179,32 +186,49 @@ def _compare(first: _Patches, second: _Patches) -> tuple[Floats, int]:
 
 
 def _alike(first: Floats, second: Floats) -> NDArray[np.bool_]:
-    """[n] of [n, 25] shapes."""
+    """[n] whether two shapes [n, 25] show the same."""
     return (first * second).sum(axis=1) >= LIKENESS
 
 
-def _patches(views: PosedImages, sight: Sight) -> list[_Patches]:
-    in_sight = int(sight.inside.sum())
-    every = -(-in_sight // min(PATCHES_AT_MOST, PATCHES_OF_A_PHOTO * len(views))) or 1
+def _sight(views: PosedImages, points: Tensor) -> tuple[Tensor, Tensor]:
+    """[V, Q] bool, which of some of the points are in front of each camera, within its photo and not masked; and
+    [V, Q] int64, their flat pixels, 0 where they are not inside."""
+    cameras = views.cameras.to("cpu", torch.float64)
+    chosen = points[:: max(1, -(-len(points) // POINTS_AT_MOST))].cpu().double()  # [Q, 3]
+    seen = chosen @ cameras.viewmats[:, :3, :3].transpose(1, 2) + cameras.viewmats[:, None, :3, 3]  # [V, Q, 3]
+    depths = seen[..., 2]
+    pixels = (seen @ cameras.Ks.transpose(1, 2))[..., :2] / depths.clamp(min=1e-9)[..., None]
+    sizes = torch.from_numpy(cameras.sizes)[:, None]  # [V, 1, 2]
+    inside = (depths > 1e-9) & (pixels >= 0).all(dim=-1) & (pixels < sizes).all(dim=-1)
+    x, y = torch.where(inside[..., None], pixels, 0.0).long().unbind(dim=-1)
+    if views.masks is not None:
+        inside &= torch.stack([views.masks.image(view)[y[view], x[view]] for view in range(len(views))])
+    flat = torch.from_numpy(views.photos.offsets[:-1])[:, None] + y * sizes[..., 0] + x
+    return inside, torch.where(inside, flat, 0)
+
+
+def _patches(views: PosedImages, points: Tensor) -> list[_Patches]:
+    inside, flats = _sight(views, points)
+    every = -(-int(inside.sum()) // min(PATCHES_AT_MOST, PATCHES_OF_A_PHOTO * len(views))) or 1
     axes = _axes_in_photos(views)
     stored, offsets = views.photos.stored, views.photos.offsets
     grid = np.stack(np.meshgrid(*[np.arange(-RADIUS, RADIUS + 1)] * 2), axis=-1).reshape(-1, 2)  # [25, 2]
     patches = []
     for view, (width, height) in enumerate(views.photos.sizes.tolist()):
-        points = every * torch.nonzero(sight.inside[view, ::every])[:, 0]
-        flat = (sight.flat[view, points] - int(offsets[view])).numpy()
+        shown = every * torch.nonzero(inside[view, ::every])[:, 0]
+        flat = (flats[view, shown] - int(offsets[view])).numpy()
         (x, y), step = axes[view], max(1.0, max(width, height) / STEPS)
         turned = np.rint(step * grid @ np.array([[x, y], [-y, x]])).astype(np.int64)  # [25, 2]
         places = np.stack([flat % width, flat // width], axis=1)[:, None] + turned  # [n, 25, 2]
         whole = ((places >= 0) & (places < (width, height))).all(axis=(1, 2))
         pixels = torch.from_numpy(int(offsets[view]) + places[whole] @ np.array([1, width]))
         colors = stored[pixels.to(stored.device)][..., :3].cpu().numpy() / np.float32(255.0)  # [n, 25, 3]
-        patches.append(_comparable(points.numpy()[whole], colors))
+        patches.append(_comparable(shown.numpy()[whole], colors))
     return patches
 
 
 def _comparable(points: Integers, colors: Floats) -> _Patches:
-    """Of patches [n, 25, 3] those that have texture, and in each channel room for a gain."""
+    """The patches, of [n, 25, 3], that have texture, and in each channel room for a gain."""
     means, luminance = colors.mean(axis=1), colors @ LUMINANCE
     shapes = luminance - luminance.mean(axis=1, keepdims=True)
     deviations = np.sqrt((shapes**2).mean(axis=1))

@@ -1,0 +1,122 @@
+"""How a model is shown beside photos: the colour behind it, and the exposures of the photos.
+
+Photos that were not trained get the exposures of the training photos taken before and after them: a camera's automatic
+follows the light, so a photo's exposure is nearly its neighbours'. Nothing of the photo itself is used but its name.
+Deutsch et al. (PPISP, CVPR 2026) have a network predict it from the render, for the same reason: test photos are then
+compared with a model of their scene, not with their camera's settings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from turbogs_plugin.config.units import parse_color
+from turbogs_plugin.engine.reference.philox import PURPOSE_BACKGROUND, host_words
+from turbogs_plugin.engine.rendering import RasterSettings
+from turbogs_plugin.scene.sequence import Neighbours, PhotoOrder
+from turbogs_plugin.types import BLACK, WHITE, Color, Step
+
+
+@dataclass(frozen=True)
+class Background:
+    """Meaning of `train.background` for a capture.
+
+    Args:
+        fixed: colour of every iteration; None: a random one each.
+        evaluated: colour of evaluations and pictures.
+    """
+
+    fixed: Color | None
+    evaluated: Color
+
+    @classmethod
+    def of(cls, setting: str, transparent: bool) -> Background:
+        """The background of a setting.
+
+        No colour of the model can stand for a random background, so what is empty or opaque in the photos becomes so in
+        the model. Evaluations have it as the kind of capture has: transparent photos on white, as published numbers of
+        NeRF-synthetic are, opaque ones on black.
+
+        Args:
+            setting: `train.background`; ``auto``, where no plan was made, is ``random`` for transparent photos.
+            transparent: whether the photos have an alpha.
+        """
+        if setting == "random" or (setting == "auto" and transparent):
+            return cls(None, WHITE if transparent else BLACK)
+        color = BLACK if setting == "auto" else parse_color(setting)
+        return cls(color, color)
+
+    def at(self, step: Step) -> Color:
+        """The colour of an iteration, a function of (seed, iteration) alone."""
+        if self.fixed is not None:
+            return self.fixed
+        red, green, blue, _ = ((word.item() + 0.5) / 2.0**32 for word in host_words(PURPOSE_BACKGROUND, 1, step))
+        return red, green, blue
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a model is shown beside the photos of V views.
+
+    Args:
+        sh_degree: highest degree in use.
+        settings: of the rasterizer.
+        background: behind the model, and behind transparent photos.
+        exposures: [V, 3, 4] of the views (`interpolated_exposures`); None: the model's own colours.
+    """
+
+    sh_degree: int
+    settings: RasterSettings
+    background: Color = BLACK
+    exposures: Tensor | None = None
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of `render_image` for the model's own colours."""
+        return {"sh_degree": self.sh_degree, "settings": self.settings, "background": self.background}
+
+    def colors(self, colors: Tensor, view_id: int) -> Tensor:
+        """[H, W, 3], 0 .. 1: the model's own colours [H, W, 3], seen by a view, with its exposure."""
+        return (colors if self.exposures is None else exposed(colors, self.exposures[view_id])).clamp(0.0, 1.0)
+
+
+def exposed(colors: Tensor, exposure: Tensor) -> Tensor:
+    """[..., 3]: ``c + A c + b`` of colours c [..., 3], by an exposure [3, 4]."""
+    return colors + (colors @ exposure[:, :3].T + exposure[:, 3])
+
+
+def interpolated_exposures(offsets: Tensor, trained: Sequence[str], photos: Sequence[str]) -> Tensor:
+    """[W, 3, 4] float32, ``A | b`` of photos: the mean of their neighbours', times how well it tells exposures.
+
+    How well is measured on the training photos, as if each were left out together with all that are nearer than the
+    photo's neighbour is (rounded up to a power of two): the slope of the least squares of their exposures against their
+    neighbours' mean, within 0 .. 1. It is nearly 1 where exposures follow the sequence, and 0, which gives the
+    identity, where they differ at random, as in a collection of many people's photos, or where a long part of the
+    sequence is missing. A photo without a neighbour has the identity, too.
+
+    Args:
+        offsets: [V, 3, 4], of the training photos (`turbogs_plugin.engine.exposures.Exposures`).
+        trained: [V] the training photos' names.
+        photos: [W] names; a training photo gets its neighbours' exposure, not its own.
+    """
+    order = PhotoOrder([*trained, *photos])
+    found = order.neighbours(trained, photos)
+    told = found.mean(offsets)
+    steps = 2 ** found.distances.clamp(min=1).log2().ceil().long()  # [W]
+    for apart in steps.unique().tolist():
+        there = (steps == apart).to(offsets.device)
+        told[there] *= _slope(offsets, order.neighbours(trained, trained, apart))
+    return told
+
+
+def _slope(offsets: Tensor, among: Neighbours) -> float:
+    """Least-squares slope of photos' exposures [V, 3, 4] on their neighbours' mean, within 0 .. 1; 0 where no photo has
+    a neighbour on either side."""
+    between = (among.weights > 0).all(dim=1).to(offsets.device)  # [V]
+    own, told = offsets[between].double(), among.mean(offsets)[between].double()
+    length = float(told.square().sum())
+    return min(1.0, max(0.0, float((own * told).sum()) / length)) if length > 0 else 0.0
