@@ -36,8 +36,8 @@ from time import monotonic
 
 import torch
 from study_tables import CAPTURES, OURS, ROOT, captures_of
-
 from turbogs_plugin.config.units import parse_seconds
+
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.report.provenance import COMMIT_VARIABLE, MODIFIED, source_commit
 from turbogs_plugin.study.grid import load_ablation

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import yaml
-
 from turbogs_plugin.config.schema import build_dataclass, nearest
+
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.pages import difference_text

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from turbogs_plugin.strategies.checks import require_settings
 
 from turbogs_plugin.engine.reference.philox import PURPOSE_STACK, PURPOSE_VIEWS, host_words
 from turbogs_plugin.errors import require
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.types import Cameras, Step
 
 
@@ -71,8 +71,8 @@ class GeometryAwareViewSampler(RandomViewSampler):
     views leave the stack.
 
     Args:
-        distance_weight: lambda_d, per scene extent.
-        direction_weight: lambda_theta.
+        distance_weight: lambda_d, weight of the distance between cameras, in scene extents; the paper gives no value.
+        direction_weight: lambda_theta, weight of the turn between cameras; the paper gives no value.
     """
 
     distance_weight: float = 2.0

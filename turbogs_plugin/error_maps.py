@@ -25,7 +25,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.device import current_stream
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.types import PixelSamples, Step
@@ -287,7 +286,7 @@ class _LaggedCopy:
                 self.copy = buffer, torch.cuda.Event()
             buffer, event = self.copy
             buffer.copy_(self.source, non_blocking=True)
-            event.record(current_stream(self.source.device))
+            event.record(torch.cuda.current_stream(self.source.device))
         self.reads += 1
         return self.values
 

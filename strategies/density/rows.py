@@ -6,16 +6,12 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-from turbogs_plugin.strategies.protocols import DensityController
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.protocols import DensityController
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate
 
 RowsType = TypeVar("RowsType")  # a dataclass of [N] tensors
-
-ADDED = ("square_sums",)
-"""Statistics that a state from another trainer may lack. They begin at zero; `choose_by: squares` refuses such a state.
-Checkpoints of runs are refused before (`checkpoint.require_like`)."""
 
 
 class WindowedDensity(DensityController):
@@ -75,9 +71,7 @@ def loaded_rows(name: str, saved: dict[str, Tensor] | None, present: RowsType | 
                 f"density {name}.{key} has shape {tuple(value.shape)}, expected {tuple(like.shape)}: "
                 "load the state together with its own model"
             )
-    loaded = {key: value.to(like.device, copy=True) for key, value in saved.items()}
-    absent = {key: torch.zeros_like(like) for key in ADDED if hasattr(present, key) and key not in saved}
-    return type(present)(**loaded, **absent)
+    return type(present)(**{key: value.to(like.device, copy=True) for key, value in saved.items()})
 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:

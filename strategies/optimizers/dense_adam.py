@@ -8,12 +8,15 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.optim.adam import adam
+
+from turbogs_plugin.engine.moments import check_state
+from turbogs_plugin.engine.reference.update import clipped, finite_gradients
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.learning_rates import LearningRates
-
-from turbogs_plugin.engine.moments import check_moments_config, check_state
-from turbogs_plugin.engine.reference.update import clipped, finite_gradients
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, RowUpdate, Step
+
+OPTIONS = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15}
+"""Decays of the moments, and what is added to sqrt(v): gsplat's values."""
 
 
 @dataclass
@@ -34,9 +37,7 @@ class DenseAdam:
     untouched, and counted.
 
     Args:
-        learning_rates: of each parameter over the run.
-        beta1, beta2: decay of the moments.
-        eps: added to sqrt(v); gsplat's value.
+        learning_rates: rate of each parameter over the run.
         opacity_reg: weight of the mean opacity, after the sigmoid, in the objective.
         scale_reg: weight of the mean standard deviation, world units, in the objective. Both are terms of the loss of
             3DGS-MCMC (Kheradmand et al. 2024; 0.01 each in gsplat's trainer). A `SparseLoss` sees only colours, so the
@@ -44,9 +45,6 @@ class DenseAdam:
     """
 
     learning_rates: LearningRates = field(default_factory=LearningRates)
-    beta1: float = 0.9
-    beta2: float = 0.999
-    eps: float = 1e-15
     opacity_reg: float = 0.0
     scale_reg: float = 0.0
     moments = None  # only an `UpdateRule` has them; here torch keeps its own
@@ -57,7 +55,6 @@ class DenseAdam:
     skipped: Tensor = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        check_moments_config(self.beta1, self.beta2, self.eps)
         require_settings(self)
 
     def setup(self, gaussians: Gaussians) -> None:
@@ -77,8 +74,7 @@ class DenseAdam:
         rates = self.learning_rates.at(step)
         # Torch's way of skipping an iteration without waiting for the device.
         nothing = (~touched.any()).to(torch.float32)
-        options = {"beta1": self.beta1, "beta2": self.beta2, "eps": self.eps}
-        options |= {"weight_decay": 0.0, "amsgrad": False, "maximize": False}
+        options = {"weight_decay": 0.0, "amsgrad": False, "maximize": False} | OPTIONS
         for count, (name, parameter) in zip(self.counts.unbind(), gaussians.items(), strict=True):
             gradient = gradients.summed(name)  # in the parameter's own shape
             rows = finite.reshape(-1, *[1] * (gradient.dim() - 1))

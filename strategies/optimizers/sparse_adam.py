@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from torch import Tensor
-from turbogs_plugin.strategies.learning_rates import LearningRates
 
 from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
 from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.rules import MomentLMParams, UpdateRule
+from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.types import GaussianGradients, Gaussians, RowUpdate, Step
 
 
@@ -24,16 +24,17 @@ class SparseAdam:
     An optimizer with another `rule` on the same moments inherits from this one, as `MomentLMOptimizer` does.
 
     Args:
-        learning_rates: of each parameter over the run.
-        beta1, beta2: decay of the moments.
-        eps: added to sqrt(v). 3DGS's value: gradients of a mean loss over a million pixels are far below Adam's
-            customary 1e-8.
+        learning_rates: rate of each parameter over the run.
+        beta1: decay of the first moment.
+        beta2: decay of the second moment.
+        eps: added to sqrt(v); no setting. 3DGS's value: gradients of a mean loss over a million pixels are far below
+            Adam's customary 1e-8.
     """
 
     learning_rates: LearningRates = field(default_factory=LearningRates)
     beta1: float = 0.9
     beta2: float = 0.999
-    eps: float = 1e-15
+    eps: float = field(default=1e-15, metadata={"setting": False})
     moments: GaussianMoments = field(init=False, repr=False)
     per_view = False
     lm: ClassVar[MomentLMParams | None] = None  # of the rule

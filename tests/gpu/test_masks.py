@@ -16,7 +16,6 @@ from helpers.raster_cases import (
     upstream,
 )
 from PIL import Image
-from turbogs_plugin.strategies.losses import CharbonnierNccLoss, SparseSsimLoss
 
 from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.cuda import raster as cuda
@@ -29,6 +28,7 @@ from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.strategies.losses import CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import BLACK, Step

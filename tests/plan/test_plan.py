@@ -8,10 +8,8 @@ import pytest
 import torch
 from helpers.framework_runs import TINY, stop_after, tiny_config
 
-from turbogs_plugin.config.auto import AUTO_SETTINGS
 from turbogs_plugin.config.configuration import apply_overrides, config_names, load_config, resolve
-from turbogs_plugin.config.old_spellings import NOW, old_spelling
-from turbogs_plugin.config.yaml_text import parse_yaml
+from turbogs_plugin.config.sections import AUTO_SETTINGS
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan import Plan, SceneFacts
 from turbogs_plugin.plan.decisions import RULES
@@ -21,6 +19,7 @@ from turbogs_plugin.scene import load_scene
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.yaml_json import parse_yaml
 
 pytestmark = pytest.mark.usefixtures("plotted")
 
@@ -130,7 +129,6 @@ BOTH_SIDES = [
     ("train.iterations", {"train_views": 2625}, (), 30000, ": 0.7 to 2.0 min on an H200; --time-budget for less or"),
     ("train.iterations", {"train_views": 500, "device": "cpu"}, (), 30000, "for less; hours or days on this CPU"),
     ("train.iterations", {"train_views": 2625, "processes": 2}, ("train.batch_for=auto",), 15000, "sampled 11.4 times"),
-    ("train.iterations", {"train_views": 2625}, ("train.base_iterations=100000",), 40000, "sampled 15.2 times"),
     ("train.iterations", {"train_views": 20}, ("train.epochs=75",), 2000, "take fewer than 2000, the least"),
     ("train.iterations", {"train_views": 43, "processes": 2}, ("train.batch_for=auto",), 1500, "fewer than 1414, the"),
     ("train.iterations", {"train_views": 43, "processes": 4}, ("train.batch_for=auto",), 1500, "fewer than 1414, the"),
@@ -261,7 +259,6 @@ def test_nothing_is_built_or_trained_by_what_is_left_to_a_plan(setting, capture)
         ("train.sh_degree=4", ["sh_degree", "4", "0 .. 3"]),
         ("train.iterations=keep", ["train.iterations", "expected a whole number or auto, got 'keep'"]),
         ("train.batch_for=0", ["batch_for", "at least 1"]),
-        ("train.base_iterations=auto", ["train.base_iterations", "whole number"]),
         ("train.epochs=0", ["epochs", "0", "above 0"]),
         ("train.maps_place=disk", ["train.maps_place", "'device'", "'host'"]),
         ("train.maps=host", ["did you mean 'maps_place'?"]),
@@ -274,31 +271,6 @@ def test_a_value_that_cannot_be_is_named(override, words):
         load_config("turbogs", [override])
     for word in words:
         assert word in str(error.value)
-
-
-@pytest.mark.parametrize("spelling", NOW)
-def test_a_spelling_of_an_earlier_version_is_refused_by_a_line_that_names_the_new_one(turbogs, tmp_path, spelling):
-    kind = ["density.type=mcmc"] if spelling == "density.cap_max" else []
-    setting, _, value = spelling.partition(": ")
-    with pytest.raises(InputError) as error:
-        load_config("turbogs", [*kind, f"{setting}={value or 1}"])
-    assert str(error.value) == f"{spelling} {NOW[spelling]}"
-    section, _, key = setting.partition(".")
-    file = tmp_path / "mine.yaml"
-    file.write_text(f"base: {'mcmc' if kind else 'turbogs'}\n{section}: {{{key}: {value or 1}}}\n")
-    with pytest.raises(InputError, match=rf"^{spelling} is "):
-        load_config(str(file))
-
-
-def test_the_new_names_are_settings():
-    known = {f"{section}.{key}" for section, values in load_config("mcmc").to_mapping().items() for key in values}
-    for now in NOW.values():
-        assert set(re.findall(r"(?:train|loss|schedule|optimizer|density)\.\w+", now)) <= known | {"schedule.views"}
-
-
-def test_a_setting_of_somebody_elses_strategy_is_not_ours_to_rename():
-    theirs = {"density": {"type": "their_own", "cap_max": 5}}
-    assert old_spelling(theirs) == "" and old_spelling({"density": {"type": "mcmc", "cap_max": 5}}) != ""
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"facts": {}, "decisions": []}', "{"])

@@ -6,12 +6,12 @@ import pytest
 import torch
 from gsplat.strategy import MCMCStrategy, ops
 from helpers.optimizers import fill, make_gaussians, random_stats
+
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.fastgs import FastGsDensity
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
 from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 from turbogs_plugin.strategies.density.none import NoDensity
-
 from turbogs_plugin.types import Gaussians, Step
 
 TOTAL, REFINE_UNTIL, COUNT = 60, 30, 40
@@ -24,9 +24,9 @@ def error_driven(**options) -> ErrorDrivenDensity:
 MAKERS = {
     "error_driven": error_driven,
     "no final": lambda: ErrorDrivenDensity(refine_from=5, refine_every=4, final_keep=1.0),
-    "fastgs": lambda: FastGsDensity(refine_from=5, refine_every=4, prune_every=9),
+    "fastgs": lambda: FastGsDensity(refine_from=5, refine_every=4),
     "mcmc": lambda: GsplatMcmcDensity(refine_start_iter=5, refine_every=4),
-    "gsplat_default": lambda: GsplatDefaultDensity(refine_start_iter=5, refine_every=4, reset_every=20),
+    "gsplat_default": lambda: GsplatDefaultDensity(refine_start_iter=5, refine_every=4),
     "none": NoDensity,
 }
 EXACT = ("error_driven", "no final", "fastgs", "mcmc", "none")

@@ -580,7 +580,7 @@ def test_refining_the_cameras_counts_as_loading(small, capture, tmp_path, monkey
 def test_the_bar_of_a_cell_has_the_planned_length(tmp_path, monkeypatch):
     scene = load_scene(tiny_capture(tmp_path))
     monkeypatch.setitem(RULES, "train.iterations", lambda facts, config: Verdict(6, "few"))
-    config = load_config("turbogs", [*TINY, "train.iterations=auto", "train.base_iterations=14"])
+    config = load_config("turbogs", [*TINY, "train.iterations=auto"])
     told = []
 
     class Bar(Listener):

@@ -9,7 +9,6 @@ import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_config
 from helpers.simulated_time import SimulatedTime
-from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed.exchange import Exchange
@@ -21,6 +20,7 @@ from turbogs_plugin.plan.pixels import TOLERANCE, pixel_budget_range, pixels_for
 from turbogs_plugin.plan.time import IterationCost
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.train import calibration, run
 
 CPU = torch.device("cpu")

@@ -55,7 +55,7 @@ def ablate(
         device: where to train.
     """
     from turbogs_plugin.config.configuration import DEFAULT_CONFIG, require_one_length
-    from turbogs_plugin.config.units import parse_seconds
+    from turbogs_plugin.config.sections import parse_seconds
     from turbogs_plugin.study import commands
     from turbogs_plugin.study.sweep import SweepOptions
 

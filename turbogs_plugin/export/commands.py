@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 
 from turbogs_plugin.config.configuration import Config
-from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.contribution import contributions, pruned
 from turbogs_plugin.export.fidelity import Change, Fidelity
@@ -97,7 +96,6 @@ def export_run(
         gaussians = pruned(gaussians, contributions(gaussians, scene.train.cameras, model.config.raster), max_gaussians)
     kept = gaussians if drop_bands is None else drop_faint_bands(gaussians, drop_bands)
     notes = _notes(whole, gaussians, kept, drop_bands)
-    notes += () if file_format == PAGE else _blur_note(model.config.raster.eps2d)
     if file_format == PAGE:
         from turbogs_plugin.export.page import write_page
 
@@ -147,9 +145,3 @@ def _notes(whole: Gaussians, kept: Gaussians, written: Gaussians, drop_bands: fl
             share = sum(band_energy(kept)[after + 1 :])
             notes.append(f"degree {before} -> {after}, without {share:.2g} of the colours' energy")
     return tuple(notes)
-
-
-def _blur_note(eps2d: float) -> tuple[str, ...]:
-    """What a file of the model does not hold, where others would not guess it."""
-    usual = DEFAULT_SETTINGS.eps2d
-    return () if eps2d == usual else (f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}",)

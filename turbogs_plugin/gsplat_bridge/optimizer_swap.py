@@ -232,7 +232,7 @@ class SharedOptimizer:
         """[1, N] the Gaussians' share of the loss, zero where nothing is known of it."""
         shares = None if info is None else loss_shares(info, len(gaussians))
         if shares is None:
-            if not self._told and hasattr(self.optimizer, "rows"):
+            if not self._told and self.optimizer.lm is not None:
                 print(
                     f"{type(self.optimizer).__name__}: the Gaussians' shares of the loss are not known, so steps are "
                     "Adam's; put prediction and ground_truth into info before loss.backward(), and call "

@@ -6,6 +6,7 @@ import platform
 import shlex
 from pathlib import Path
 
+from turbogs_plugin.config.sections import STRIPS
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.machine import hardware, software
@@ -35,7 +36,7 @@ def write_report(run: RunSession, process: PlotProcess | None = None) -> Path:
     run.clock.mark("report")
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
-    strips = min(len(run.test), config.report.strips)
+    strips = min(len(run.test), STRIPS)
     plots = _plots(run, pictures)
     if process is not None:
         process.begin(plots)

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from turbogs_plugin.config.schema import nearest
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.errors import InputError, nearest
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.study.grid import Ablation, CellKey
 from turbogs_plugin.study.results import CellResult, Failure, Study

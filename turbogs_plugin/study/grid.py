@@ -18,12 +18,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from turbogs_plugin.config.auto import AUTO
 from turbogs_plugin.config.configuration import Config, load_config, named_beside
 from turbogs_plugin.config.scaling import with_iterations
-from turbogs_plugin.config.schema import build_dataclass, nearest
-from turbogs_plugin.config.yaml_text import read_named_yaml
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.config.sections import AUTO
+from turbogs_plugin.config.typed import build_dataclass
+from turbogs_plugin.errors import InputError, nearest
+from turbogs_plugin.yaml_json import read_named_yaml
 
 PACKAGE = "turbogs_plugin.configs.ablations"
 """Where the packaged ablations are."""
@@ -112,7 +112,7 @@ def alike_at(ablation: Ablation, variants: Sequence[str], overrides: Sequence[st
     def text(variant: str, length: int | None) -> str:
         mapping = variant_config(ablation, variant, 0, overrides, length).to_mapping()
         if mapping["train"]["iterations"] != AUTO:
-            del mapping["train"]["epochs"], mapping["train"]["base_iterations"]
+            del mapping["train"]["epochs"]
         return json.dumps(mapping, sort_keys=True)
 
     alike: dict[str, str] = {}

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from turbogs_plugin.config.configuration import config_names, resolve
-from turbogs_plugin.config.units import parse_seconds
+from turbogs_plugin.config.sections import parse_seconds
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.report.provenance import Provenance

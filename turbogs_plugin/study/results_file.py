@@ -15,8 +15,8 @@ from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from turbogs_plugin.config.schema import build_dataclass, convert, dataclass_mapping, nearest
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.config.typed import build_dataclass, convert, dataclass_mapping
+from turbogs_plugin.errors import InputError, nearest
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.study.difference import common_configuration, difference, flattened, nested, restored
 from turbogs_plugin.study.grid import Ablation

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from turbogs_plugin.config.configuration import Config
-from turbogs_plugin.config.old_spellings import old_spelling
+from turbogs_plugin.config.sections import STRIPS
 from turbogs_plugin.device import free_device_memory, synchronize
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import Provenance
@@ -180,7 +180,7 @@ def run_sweep(
                     continue
                 progress.begin(key)
                 path = (folder.tensorboard / key.file).with_suffix("")
-                events = [EventWriter(path, scene.test, config.report.strips)] if config.report.tensorboard else []
+                events = [EventWriter(path, scene.test, STRIPS)] if config.report.tensorboard else []
                 listeners = [progress, *events]
                 try:
                     trained = (key.variant, key.scene) in warm
@@ -243,9 +243,6 @@ def _scene_configs(
 
 
 def _require_same(present: CellResult, config: Config) -> None:
-    old = old_spelling(present.asked)
-    if old:
-        raise InputError(f"the cell '{present.key}' is of an earlier version ({old}): choose a new --out")
     changes = difference(compared(present.asked, UNCOMPARED), compared(config.to_mapping(), UNCOMPARED))
     if changes:
         sections = dict.fromkeys(path.partition(".")[0] for path in [*changes.pop(ABSENT, ()), *changes])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from turbogs_plugin.config.units import parse_color
+from turbogs_plugin.config.sections import parse_color
 from turbogs_plugin.engine.reference.philox import PURPOSE_BACKGROUND, host_words
 from turbogs_plugin.types import BLACK, WHITE, Color, Step
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from turbogs_plugin.config.auto import AUTO
 from turbogs_plugin.config.configuration import Config, resolve
+from turbogs_plugin.config.sections import AUTO
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine import compiled_kernels
