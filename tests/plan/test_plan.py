@@ -260,7 +260,7 @@ def test_nothing_is_built_or_trained_by_what_is_left_to_a_plan(setting, capture)
         ("train.iterations=keep", ["train.iterations", "expected a whole number or auto, got 'keep'"]),
         ("train.batch_for=0", ["batch_for", "at least 1"]),
         ("train.epochs=0", ["epochs", "0", "above 0"]),
-        ("train.maps_place=disk", ["train.maps_place", "'device'", "'host'"]),
+        ("train.maps_place=disk", ["train.maps_place", "device", "host"]),
         ("train.maps=host", ["did you mean 'maps_place'?"]),
         ("density.type=auto", ["unknown density.type 'auto'"]),
         ("loss.type=charbonnier\nloss.views: 3", ["more than one value"]),
