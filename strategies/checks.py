@@ -26,9 +26,8 @@ def require_settings(instance: Any) -> None:
             require_not_negative(instance, name)
 
 
-@cache  # it compiles every annotation, and a trainer may make a loss in each step
-def _type_hints(strategy: type) -> dict[str, Any]:
-    return get_type_hints(strategy)
+_type_hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)
+"""Cached, as it compiles every annotation, and a trainer may make a loss in each step."""
 
 
 def require_each(instance: Any, valid: Callable[[Any], bool], allowed: str, *names: str) -> None:

@@ -77,7 +77,8 @@ class ErrorMaps:
         self._allocate()
         self.view_sums = torch.zeros(len(self.sizes), dtype=torch.float64, device=self.device)
         self._means = _LaggedCopy(self.view_sums, self.refresh)
-        self._sums_read, self._view_means = None, np.zeros(0)  # the latest means, and the sums that they are of
+        self._sums_read: np.ndarray | None = None
+        self._view_means = np.zeros(0)  # the latest means, and the sums that they are of
 
     def _allocate(self) -> None:
         self.offsets = np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1))])  # [V + 1]

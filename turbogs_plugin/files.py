@@ -71,7 +71,7 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
-def write_atomically(path: Path, write: Callable[[BinaryIO], None], large: bool = False) -> None:
+def write_atomically(path: Path, write: Callable[[BinaryIO], object], large: bool = False) -> None:
     """Write a file beside its destination, bring it to the disk, and put it in place by one rename.
 
     Whatever interrupts this (a full disk, a kill), `path` is what it was before or is complete. Several processes may

@@ -140,7 +140,7 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def scores(self, step: Step) -> tuple[Tensor, Tensor]:
         """([N] difficulty score, [N] bool seen) of the present window. The score 0 of an unseen one has no meaning."""
-        stats, seen = self._stats, self._seen()
+        stats, seen = self.window, self._seen()
         errors, distances = (
             torch.where(seen, sums / (stats.weight_sums + EPS), 0.0) for sums in (stats.error_sums, stats.distance_sums)
         )
@@ -194,7 +194,7 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def _seen(self) -> Tensor:
         """[N] bool: with a weight in the present window, and finite sums."""
-        stats = self._stats
+        stats = self.window
         weights = stats.weight_sums
         return (weights > 0) & torch.isfinite(weights + stats.error_sums + stats.distance_sums)
 
@@ -206,7 +206,7 @@ class ErrorDrivenDensity(WindowedDensity):
         sound = finite & (torch.sigmoid(gaussians.opacities) >= self.prune_opacity)
         if self.prune_score_fraction > 0:
             sound &= ~_lowest(worth, known & seen & ~spared, self.prune_score_fraction)
-        keys = drawn_by_squares(self._stats, step) if self.choose_by == "squares" else worth
+        keys = drawn_by_squares(self.window, step) if self.choose_by == "squares" else worth
         order = _descending(keys)  # who grows first
         candidates = self._passing(worth, seen) & sound
         if self.choose_by == "squares":
@@ -225,7 +225,7 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def _passing(self, worth: Tensor, seen: Tensor) -> Tensor:
         """[N] bool, which pass the gates: a high screen gradient and, by difficulty, a high score."""
-        stats = self._stats
+        stats = self.window
         views = stats.view_counts.clamp(min=1)
         absolute = seen & (stats.absgrad_sums / views > self.absgrad_threshold)
         if self.choose_by == "squares":
@@ -247,7 +247,7 @@ class ErrorDrivenDensity(WindowedDensity):
             limit = self.prune_world_size * reference
         oversized = largest > limit
         if begun and self.prune_screen_size > 0:
-            oversized |= self._stats.max_radii > self.prune_screen_size
+            oversized |= self.window.max_radii > self.prune_screen_size
         return oversized
 
     def _worth(self, step: Step) -> tuple[Tensor, Tensor, Tensor]:
@@ -257,7 +257,7 @@ class ErrorDrivenDensity(WindowedDensity):
         squares it is worth least.
         """
         if self.choose_by == "squares":
-            return *squares_of(self._stats), self._seen()
+            return *squares_of(self.window), self._seen()
         score, seen = self.scores(step)
         return score, seen, seen
 

@@ -121,18 +121,19 @@ class FastGsDensity(DensityController):
 
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        if self._batch is None:
+        batch, window, votes = self._batch, self._window, self._votes
+        if batch is None or window is None or votes is None:
             if not self._over(step):  # a time budget has made the run longer
                 self._restart(len(gaussians), gaussians.device)
             return None
-        self._votes.add(self._batch)
-        add_stats(self._window, self._batch)
-        self._batch.zero_()
+        votes.add(batch)
+        add_stats(window, batch)
+        batch.zero_()
         update = None
         if self._events.due(step)[0]:
-            update = self._densify(gaussians, step)
+            update = self._densify(gaussians, step, window, votes)
         elif self._prune_due(step):
-            update = self._prune(gaussians)
+            update = self._prune(gaussians, votes)
         if self.event_due(step):
             self._restart(len(gaussians), gaussians.device)
         if self._over(step):
@@ -162,8 +163,7 @@ class FastGsDensity(DensityController):
         self._batch, self._window = GaussianStats.zeros(count, device), GaussianStats.zeros(count, device)
         self._votes = ViewVotes.zeros(count, device)
 
-    def _densify(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        votes, window = self._votes, self._window
+    def _densify(self, gaussians: Gaussians, step: Step, window: GaussianStats, votes: ViewVotes) -> RowUpdate | None:
         agreed = (votes.marked >= CONSISTENCY * votes.seen) & (votes.seen > 0)
         window.grad_sums *= agreed
         window.absgrad_sums *= agreed
@@ -171,10 +171,10 @@ class FastGsDensity(DensityController):
         self._events.load_state_dict({"stats": vars(window)})
         return self._events.update(gaussians, step)
 
-    def _prune(self, gaussians: Gaussians) -> RowUpdate | None:
+    def _prune(self, gaussians: Gaussians, votes: ViewVotes) -> RowUpdate | None:
         if len(gaussians) == 0:
             return None
-        blame = self._votes.blame
+        blame = votes.blame
         blamed = blame > BLAME_THRESHOLD * blame.max()
         blamed &= ~blamed.all()  # all alike: nothing distinguishes them
         transparent = torch.sigmoid(gaussians.opacities) < self._events.prune_opacity

@@ -72,7 +72,11 @@ class GsplatDefaultDensity(WindowedDensity):
             refine_start_iter=self.refine_start_iter, refine_every=self.refine_every, refine_stop_iter=step.refine_until
         )
         values = {name: value[usable] for name, value in gaussians.items()}
-        state = {"grad2d": self._stats.grad_sums, "count": self._stats.view_counts, "radii": self._stats.max_radii}
+        state: dict[str, Any] = {
+            "grad2d": self._stats.grad_sums,
+            "count": self._stats.view_counts,
+            "radii": self._stats.max_radii,
+        }
         state = {name: rows[usable] for name, rows in state.items()}
         # gsplat treats the row numbers as one more running statistic.
         state |= {"source_row": usable, "scene_scale": step.scene_extent}
@@ -85,7 +89,7 @@ class GsplatDefaultDensity(WindowedDensity):
 
     def _keep_one(self, gaussians: Gaussians) -> RowUpdate | None:
         """Keep only the most opaque finite Gaussian, so that the model is never empty."""
-        self._stats.zero_()
+        self.window.zero_()
         return removal(leave_one(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians))
 
     def _change(self, gaussians: Gaussians, params: dict, optimizers: dict, state: dict) -> RowUpdate | None:
@@ -94,7 +98,7 @@ class GsplatDefaultDensity(WindowedDensity):
         fresh, opacity_fresh = (new_rows(params, optimizers, name) for name in ("means", "opacities"))
         was_reset = bool(opacity_fresh.all()) and not bool(fresh.all())
         if not bool(state["count"].any()):  # gsplat starts a new window after a refinement
-            self._stats.zero_()
+            self.window.zero_()
         if len(source) == len(gaussians) and not was_reset and not bool(fresh.any()):
             return None
         present = torch.bincount(source, minlength=len(gaussians))
@@ -124,7 +128,9 @@ def run_gsplat(
         The parameters afterwards, and optimizers for `new_rows`.
     """
     params = {name: torch.nn.Parameter(value, requires_grad=False) for name, value in values.items()}
-    optimizers = {name: torch.optim.SGD([param], lr=0.0) for name, param in params.items()}
+    optimizers: dict[str, torch.optim.Optimizer] = {
+        name: torch.optim.SGD([param], lr=0.0) for name, param in params.items()
+    }
     for name, param in params.items():  # gsplat puts 0 where it makes or resets rows
         optimizers[name].state[param]["known"] = torch.ones(len(param), device=param.device)
     device = params["means"].device

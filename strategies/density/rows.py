@@ -23,6 +23,15 @@ class WindowedDensity(DensityController):
     def stats(self) -> GaussianStats | None:
         return self._stats
 
+    @property
+    def window(self) -> GaussianStats:
+        """The statistics. Raises RuntimeError, an error of the caller's code, where none are kept."""
+        if self._stats is None:
+            raise RuntimeError(
+                "density control keeps no statistics: call setup before, and nothing after its last event"
+            )
+        return self._stats
+
     def setup(self, gaussians: Gaussians) -> None:
         self._stats = GaussianStats.zeros(len(gaussians), gaussians.device)
 

@@ -15,7 +15,7 @@ from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, RowUpdate, Step
 
-OPTIONS = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15}
+BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
 """Decays of the moments, and what is added to sqrt(v): gsplat's values."""
 
 
@@ -74,7 +74,6 @@ class DenseAdam:
         rates = self.learning_rates.at(step)
         # Torch's way of skipping an iteration without waiting for the device.
         nothing = (~touched.any()).to(torch.float32)
-        options = {"weight_decay": 0.0, "amsgrad": False, "maximize": False} | OPTIONS
         for count, (name, parameter) in zip(self.counts.unbind(), gaussians.items(), strict=True):
             gradient = gradients.summed(name)  # in the parameter's own shape
             rows = finite.reshape(-1, *[1] * (gradient.dim() - 1))
@@ -85,8 +84,23 @@ class DenseAdam:
             if name == "scales" and self.scale_reg > 0:
                 gradient += clipped(self.scale_reg / max(1, parameter.numel()) * parameter.exp())
             exp_avg, exp_avg_sq = (getattr(moments, name) for moments in (self.exp_avg, self.exp_avg_sq))
-            lists = ([value] for value in (parameter, gradient, exp_avg, exp_avg_sq))
-            adam(*lists, [], [count], fused=True, found_inf=nothing, lr=getattr(rates, name), **options)
+            adam(
+                [parameter],
+                [gradient],
+                [exp_avg],
+                [exp_avg_sq],
+                [],
+                [count],
+                fused=True,
+                found_inf=nothing,
+                amsgrad=False,
+                beta1=BETA1,
+                beta2=BETA2,
+                lr=getattr(rates, name),
+                weight_decay=0.0,
+                eps=EPS,
+                maximize=False,
+            )
 
     def apply(self, update: RowUpdate) -> None:
         for moments in (self.exp_avg, self.exp_avg_sq):
@@ -96,7 +110,7 @@ class DenseAdam:
                 getattr(moments, name).zero_()
 
     def state_dict(self) -> dict[str, Any]:
-        state = {}
+        state: dict[str, Any] = {}
         for moment in ("exp_avg", "exp_avg_sq"):
             state |= {f"{moment}.{name}": value for name, value in getattr(self, moment).items()}
         return {**state, "counts": self.counts, "skipped": self.skipped}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 from torch import Tensor
 
@@ -36,11 +36,18 @@ class SparseAdam:
     beta2: float = 0.999
     eps: float = field(default=1e-15, metadata={"setting": False})
     moments: GaussianMoments = field(init=False, repr=False)
-    per_view = False
-    lm: ClassVar[MomentLMParams | None] = None  # of the rule
 
     def __post_init__(self) -> None:
         check_moments_config(self.beta1, self.beta2, self.eps)
+
+    @property
+    def per_view(self) -> bool:
+        return False
+
+    @property
+    def lm(self) -> MomentLMParams | None:
+        """The damped system of the rule, or None for Adam's step."""
+        return None
 
     @property
     def skipped(self) -> Tensor:

@@ -96,7 +96,9 @@ class Config:
         return yaml_text(self.to_mapping())
 
 
-SECTION_CLASSES = {name: hint for name, hint in get_type_hints(Config).items() if is_dataclass(hint)}
+SECTION_CLASSES: dict[str, type] = {
+    name: hint for name, hint in get_type_hints(Config).items() if isinstance(hint, type) and is_dataclass(hint)
+}
 """Section that is no strategy's -> its dataclass."""
 
 
@@ -190,7 +192,7 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         parsed = {"value": text} if plain else parse_yaml(f"value: {text}", f"override '{override}'")
         if set(parsed) != {"value"}:
             raise InputError(f"override '{override}' has more than one value")
-        nested = parsed["value"]
+        nested: Any = parsed["value"]
         for key in reversed(keys):
             nested = {key: nested}
         result = _merge(result, nested)

@@ -141,10 +141,10 @@ class TrainConfig:
     checkpoint_every: int = 10_000
 
     def __post_init__(self) -> None:
-        countable = self.iterations == AUTO or 1 <= self.iterations < 2**31
+        countable = isinstance(self.iterations, str) or 1 <= self.iterations < 2**31
         require(countable, "iterations", self.iterations, "within 1 .. 2^31 - 1")
         require(math.isfinite(self.epochs) and self.epochs > 0, "epochs", self.epochs, "a finite number above 0")
-        require(self.batch_for == AUTO or self.batch_for >= 1, "batch_for", self.batch_for, "at least 1")
+        require(isinstance(self.batch_for, str) or self.batch_for >= 1, "batch_for", self.batch_for, "at least 1")
         require(self.refine_until >= 0, "refine_until", self.refine_until, "at least 0")
         require(0 <= self.seed < 2**31, "seed", self.seed, "within 0 .. 2^31 - 1")
         require(self.device in ("auto", "cpu", "cuda"), "device", self.device, "auto, cpu or cuda")
@@ -156,7 +156,9 @@ class TrainConfig:
         require(self.sh_interval >= 1, "sh_interval", self.sh_interval, "at least 1")
         require(0 < self.initial_opacity < 1, "initial_opacity", self.initial_opacity, "more than 0 and less than 1")
         require(0 < self.initial_size <= 100, "initial_size", self.initial_size, "more than 0 and at most 100")
-        require(self.dropout == AUTO or 0 <= self.dropout < 1, "dropout", self.dropout, "at least 0, less than 1")
+        require(
+            isinstance(self.dropout, str) or 0 <= self.dropout < 1, "dropout", self.dropout, "at least 0, less than 1"
+        )
         require_not_negative(self, "distant_size")
         require(0 <= self.average_last <= 1, "average_last", self.average_last, "within 0 .. 1")
         for value in self.evaluate_at:
@@ -166,7 +168,7 @@ class TrainConfig:
     @property
     def written_iterations(self) -> int:
         """Iterations for which the settings that count iterations are written."""
-        return WRITTEN_FOR if self.iterations == AUTO else self.iterations
+        return WRITTEN_FOR if isinstance(self.iterations, str) else self.iterations
 
     @property
     def starts_from_model(self) -> bool:
@@ -175,7 +177,8 @@ class TrainConfig:
 
     def evaluation_iterations(self) -> set[int]:
         """Counts of finished iterations after which to evaluate."""
-        return {0, self.iterations, *(max(1, round(part * self.iterations)) for part in self.evaluate_at)}
+        total = self.written_iterations
+        return {0, total, *(max(1, round(part * total)) for part in self.evaluate_at)}
 
     def sh_degree_at(self, iteration: int) -> int:
         """Degree of the bands in use at an iteration."""

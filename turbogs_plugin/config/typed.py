@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import cache
@@ -62,7 +62,9 @@ def build_dataclass(cls: type[T], mapping: Any, where: str, also: Iterable[str] 
         raise InputError(f"{where}: {error}") from error
 
 
-_type_hints = cache(typing.get_type_hints)  # each call evaluates every annotation of the class again
+_type_hints: Callable[[Any], dict[str, Any]] = cache(
+    typing.get_type_hints
+)  # each call evaluates every annotation of the class again
 
 
 def dataclass_mapping(instance: Any) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -75,12 +75,12 @@ class TurboDensityStrategy(DefaultStrategy):
     absgrad: bool = True
     grow_absgrad2d: float = TUNED_DENSITY.absgrad_threshold
     lambda_base: float = TUNED_DENSITY.lambda_base
-    score: str = TUNED_DENSITY.score
+    score: Literal["balanced", "raw"] = TUNED_DENSITY.score
     top_fraction: float = TUNED_DENSITY.top_fraction
-    split: str = TUNED_DENSITY.split
+    split: Literal["sample", "long_axis"] = TUNED_DENSITY.split
     max_gaussians: int = TUNED_DENSITY.max_gaussians
     prune_score_fraction: float = TUNED_DENSITY.prune_score_fraction
-    choose_by: str = TUNED_DENSITY.choose_by
+    choose_by: Literal["difficulty", "squares"] = TUNED_DENSITY.choose_by
     opacity_decay: float = TUNED_DENSITY.opacity_decay
     final_every: int = TUNED_DENSITY.final_every
     final_keep: float = TUNED_DENSITY.final_keep

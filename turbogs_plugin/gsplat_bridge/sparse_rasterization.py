@@ -131,14 +131,15 @@ def sparse_rasterization(
     info = _info(render, len(viewmats), width, height)
     observer.info = weakref.ref(info)
     alphas = render.alphas[:, None]  # [P, 1]
+    depths = alphas if render.depths is None else render.depths[:, None]  # [P, 1], where it was asked for
     if render_mode == "ED":
-        return render.depths[:, None], alphas, info
+        return depths, alphas, info
     rendered_colors = render.colors
     if backgrounds is not None:
         behind = backgrounds[samples.view_of_slot()] * samples.filled[:, None]  # [P, 3]
         rendered_colors = rendered_colors + (1.0 - alphas) * behind
     if render_mode == "RGB+ED":
-        rendered_colors = torch.cat([rendered_colors, render.depths[:, None]], dim=1)
+        rendered_colors = torch.cat([rendered_colors, depths], dim=1)
     return rendered_colors, alphas, info
 
 
@@ -197,13 +198,15 @@ def _map_update(maps: ErrorMaps | None, step: Step | None, device: torch.device)
     """What is to be done with the errors; None if nothing."""
     if maps is None and step is None:
         return None
+    if isinstance(maps, ErrorMaps) and isinstance(step, Step):
+        if maps.errors.device != device:
+            raise InputError(f"maps are on {maps.errors.device}: expected {device} as colors")
+        return MapUpdate(maps, step)
     for name, value, kind in (("maps", maps, ErrorMaps), ("step", step, Step)):
         if not isinstance(value, kind):
             other = "step" if name == "maps" else "maps"
             raise InputError(f"{name} is a {type(value).__name__}: expected {kind.__name__}, as {other} is given")
-    if maps.errors.device != device:
-        raise InputError(f"maps are on {maps.errors.device}: expected {device} as colors")
-    return MapUpdate(maps, step)
+    return None
 
 
 def _evaluate_and_learn(
