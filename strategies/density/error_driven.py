@@ -11,9 +11,8 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_settings, require_share
-from turbogs_plugin.strategies.density.priority import drawn_by_squares, squares_of
+from turbogs_plugin.strategies.density.growth import drawn_by_squares, split_in_two, squares_of
 from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, keep_one, removal
-from turbogs_plugin.strategies.density.splitting import split_in_two
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 EPS = 1e-12
@@ -77,7 +76,7 @@ class ErrorDrivenDensity(WindowedDensity):
             behind the scene, which few photos see. 0: none.
         choose_by: rule by which Gaussians grow and are removed. `difficulty`, the paper's: all grow that pass the
             thresholds, or the most difficult of them where `max_gaussians` has no room for all; the easiest are removed
-            first. `squares` (see `priority`): as many grow as pass the threshold of the absolute gradient; which ones
+            first. `squares` (see `growth`): as many grow as pass the threshold of the absolute gradient; which ones
             is drawn at random among those seen, in proportion to their squares. Those with the least squares are
             removed first. `grad_threshold`, `top_fraction`, `score` and `lambda_base` then mean nothing.
         final_every: interval of the final pruning, Delta_prune; 500 in the paper. There are `FINAL_PRUNINGS` at most,

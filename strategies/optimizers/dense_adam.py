@@ -15,8 +15,9 @@ from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, RowUpdate, Step
 
-BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
-"""Decays of the moments, and what is added to sqrt(v): gsplat's values."""
+OPTIONS: dict[str, Any] = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15}
+OPTIONS |= {"weight_decay": 0.0, "amsgrad": False, "maximize": False}
+"""Adam's options, gsplat's values: decays of the moments, and eps, which is added to sqrt(v)."""
 
 
 @dataclass
@@ -84,23 +85,8 @@ class DenseAdam:
             if name == "scales" and self.scale_reg > 0:
                 gradient += clipped(self.scale_reg / max(1, parameter.numel()) * parameter.exp())
             exp_avg, exp_avg_sq = (getattr(moments, name) for moments in (self.exp_avg, self.exp_avg_sq))
-            adam(
-                [parameter],
-                [gradient],
-                [exp_avg],
-                [exp_avg_sq],
-                [],
-                [count],
-                fused=True,
-                found_inf=nothing,
-                amsgrad=False,
-                beta1=BETA1,
-                beta2=BETA2,
-                lr=getattr(rates, name),
-                weight_decay=0.0,
-                eps=EPS,
-                maximize=False,
-            )
+            options = {"fused": True, "found_inf": nothing, "lr": getattr(rates, name), **OPTIONS}
+            adam([parameter], [gradient], [exp_avg], [exp_avg_sq], [], [count], **options)
 
     def apply(self, update: RowUpdate) -> None:
         for moments in (self.exp_avg, self.exp_avg_sq):
