@@ -96,41 +96,36 @@ def convert(value: Any, hint: Any, where: str) -> Any:
     if is_dataclass(hint) and isinstance(hint, type):
         return build_dataclass(hint, value, where)
     if origin in UNIONS:
-        others = [argument for argument in arguments if argument is not type(None)]
-        if len(others) == 1 and value is not None:
-            return convert(value, others[0], where)
         for argument in arguments:
             with suppress(InputError):
                 return convert(value, argument, where)
-    elif origin is Literal:
-        if value in arguments:
-            return value
-    elif origin in (tuple, list):
+    elif origin is list or (origin is tuple and arguments[-1] is Ellipsis):
         if isinstance(value, tuple | list):
-            hints = arguments if _is_fixed(hint) else arguments[:1] * len(value)
-            if len(hints) == len(value):
-                items = enumerate(zip(value, hints, strict=True))
-                return origin(convert(item, kind, f"{where}[{index}]") for index, (item, kind) in items)
+            return origin(convert(item, arguments[0], f"{where}[{place}]") for place, item in enumerate(value))
+    elif origin is tuple:
+        if isinstance(value, tuple | list) and len(value) == len(arguments):
+            return tuple(convert(item, kind, where) for item, kind in zip(value, arguments, strict=True))
     elif origin is dict:
         if isinstance(value, Mapping):
-            for key in value:
-                if arguments[0] is str and not isinstance(key, str):
-                    raise InputError(f"{where}: the name {key!r} is not text: put it in quotes, '{key}'")
-            return {key: convert(item, arguments[1], f"{where}.{key}") for key, item in value.items()}
+            return {_key(key, where): convert(item, arguments[1], f"{where}.{key}") for key, item in value.items()}
     elif hint is float:
         if number and not math.isnan(value):
             return float(value)
     elif hint is int:
         if number and math.isfinite(value) and value == int(value):
             return int(value)
+    elif origin is Literal:
+        if value in arguments:
+            return value
     elif hint not in NAMES or isinstance(value, hint):
         return value
     raise InputError(f"{where}: expected {_named(hint)}, got {value!r}")
 
 
-def _is_fixed(hint: Any) -> bool:
-    """Whether a hint is of a tuple of so many values."""
-    return typing.get_origin(hint) is tuple and typing.get_args(hint)[-1] is not Ellipsis
+def _key(key: Any, where: str) -> str:
+    if not isinstance(key, str):
+        raise InputError(f"{where}: the name {key!r} is not text: put it in quotes, '{key}'")
+    return key
 
 
 def _named(hint: Any) -> str:
@@ -141,5 +136,5 @@ def _named(hint: Any) -> str:
     if origin is Literal:
         return " or ".join(map(str, arguments))
     if origin in (tuple, list):
-        return f"a list of {len(arguments)} values" if _is_fixed(hint) else "a list, as [A, B]"
+        return "a list, as [A, B]" if Ellipsis in arguments or origin is list else f"a list of {len(arguments)} values"
     return NAMES.get(hint, "a mapping of keys")
