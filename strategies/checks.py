@@ -1,4 +1,4 @@
-"""Checks of the settings of strategies, and the settings that two strategies share."""
+"""Checks of the settings of strategies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def require_settings(instance: Any) -> None:
     """
     hints = _type_hints(type(instance))
     for name in [field.name for field in fields(instance) if field.init]:
-        value = getattr(instance, name)
+        value = vars(instance)[name]
         if get_origin(hints[name]) is Literal:
             allowed = get_args(hints[name])
             require(value in allowed, name, value, f"one of {', '.join(allowed)}")
@@ -26,15 +26,14 @@ def require_settings(instance: Any) -> None:
             require_not_negative(instance, name)
 
 
-@cache  # it compiles every annotation, and a trainer may make a loss in each step
-def _type_hints(strategy: type) -> dict[str, Any]:
-    return get_type_hints(strategy)
+_type_hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)
+"""Cached, as it compiles every annotation, and a trainer may make a loss in each step."""
 
 
 def require_each(instance: Any, valid: Callable[[Any], bool], allowed: str, *names: str) -> None:
     """Raise `InputError` unless each of these attributes is `valid`; `allowed` describes the valid values."""
     for name in names:
-        value = getattr(instance, name)
+        value = vars(instance)[name]
         require(valid(value), name, value, allowed)
 
 
@@ -51,9 +50,3 @@ def require_positive(instance: Any, *names: str) -> None:
 def require_share(instance: Any, *names: str) -> None:
     """Raise `InputError` unless each of these attributes is above 0 and at most 1."""
     require_each(instance, lambda value: 0 < value <= 1, "more than 0 and at most 1", *names)
-
-
-def shared_settings(instance: Any, other: type) -> dict[str, Any]:
-    """The init fields of a dataclass that the dataclass `other` has too, as name -> value."""
-    theirs = {field.name for field in fields(other) if field.init}
-    return {field.name: getattr(instance, field.name) for field in fields(instance) if field.name in theirs}

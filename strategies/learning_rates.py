@@ -20,14 +20,14 @@ class LearningRates:
 
     Args:
         means: rate of the means at the first iteration, in units of the scene extent.
-        means_final: the same at the last iteration; between them the rate decays exponentially.
-        scales: of the log standard deviations.
-        quats: of the quaternions.
-        opacities: of the opacity logits.
-        sh0: of band 0.
-        shN: of the higher bands.
-        final_factor: the rates of all but the means fall exponentially, over the run, to this share of themselves.
-        batch_scale: multiplies every rate at every iteration, whatever K is at that iteration. 2 gained 0.5 dB over 1
+        means_final: rate of the means at the last iteration; between the two the rate decays exponentially.
+        scales: rate of the log standard deviations.
+        quats: rate of the quaternions.
+        opacities: rate of the opacity logits.
+        sh0: rate of band 0.
+        shN: rate of the higher bands.
+        final_factor: share of themselves to which all rates but the means' fall exponentially over the run.
+        batch_scale: factor of every rate at every iteration, whatever K is at that iteration. 2 gained 0.5 dB over 1
             (fox, 4000 iterations, K from 10 down to 3); one-view baselines (3DGS) set 1.
     """
 

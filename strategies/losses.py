@@ -7,7 +7,7 @@ has no loss. Formulas: `turbogs_plugin.engine.reference.losses`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from torch import Tensor
@@ -16,22 +16,18 @@ from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.rules import STRUCTURE_CONSTANT, LossTerms
 from turbogs_plugin.errors import require
 from turbogs_plugin.strategies.checks import require_positive, require_settings
+from turbogs_plugin.strategies.protocols import SparseLoss
 from turbogs_plugin.types import LossOutput, PixelSamples
+
+EPSILON = 1e-3
+"""eps of the Charbonnier term: residuals below it are treated quadratically."""
 
 
 @dataclass
-class RuleLoss:
+class RuleLoss(SparseLoss):
     """A loss described by its terms. When called, the engine of the colours' device evaluates it."""
 
-    epsilon: float = 1e-3
-
-    def __post_init__(self) -> None:
-        require_positive(self, "epsilon")
-
-    @property
-    def terms(self) -> LossTerms:
-        """This loss as a rule for engines."""
-        return LossTerms(self.epsilon)
+    terms: LossTerms = field(init=False, repr=False, compare=False, default_factory=lambda: LossTerms(EPSILON))
 
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
         return engine_of(colors.device).evaluate(self.terms, colors, targets, samples)
@@ -42,10 +38,7 @@ class CharbonnierLoss(RuleLoss):
     """The Charbonnier l1 term alone: mean over filled samples and channels of ``w (sqrt(d^2 + eps^2) - eps)``.
 
     l1(p) is the mean over the three channels, not their sum, so it has the size of a dense L1 loss in gsplat.
-    Each entry of the gradient is at most ``w / (3 n)``, n the number of filled samples.
-
-    Args:
-        epsilon: residuals below it are treated quadratically.
+    Each entry of the gradient is at most ``w / (3 n)``, n the number of filled samples; eps is `EPSILON`.
     """
 
 
@@ -66,10 +59,9 @@ class CharbonnierNccLoss(RuleLoss):
     x = y; that of the structure term also in tiles of one sample, or constant in both x and y.
 
     Args:
-        epsilon: of the Charbonnier term.
         ncc_weight: factor of the structure term; 1 in the paper.
-        structure: `ncc`, with a variance floor in numerator and denominator, so that a flat tile scores 1; or
-            `printed_ncc`, as the appendix has it: a flat tile scores 0.
+        structure: similarity S of a tile: `ncc`, with a variance floor in numerator and denominator, so that a flat
+            tile scores 1; or `printed_ncc`, as the appendix has it: a flat tile scores 0.
         variance_constant: c, variance below which a tile counts as flat; SSIM's by default. NCC's floor is c / 2. The
             printed NCC adds it as its epsilon to a product of two variances: 1e-6 there means two variances of 1e-3.
     """
@@ -79,14 +71,10 @@ class CharbonnierNccLoss(RuleLoss):
     variance_constant: float = STRUCTURE_CONSTANT
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         require_positive(self, "variance_constant")
         require_settings(self)
-
-    @property
-    def terms(self) -> LossTerms:
-        return LossTerms(
-            self.epsilon,
+        self.terms = LossTerms(
+            EPSILON,
             structure=self.structure,
             structure_weight=self.ncc_weight,
             variance_constant=self.variance_constant,
@@ -102,18 +90,12 @@ class SparseSsimLoss(RuleLoss):
     at the tile's edge. It is of use where whole tiles are sampled.
 
     Args:
-        epsilon: of the Charbonnier term.
-        ssim_weight: 0 .. 1.
+        ssim_weight: weight of the structure term, 0 .. 1; 0.2 in 3DGS.
     """
 
     ssim_weight: float = 0.2
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
-
-    @property
-    def terms(self) -> LossTerms:
-        return LossTerms(
-            self.epsilon, l1_weight=1.0 - self.ssim_weight, structure="ssim", structure_weight=self.ssim_weight
-        )
+        weight = self.ssim_weight
+        self.terms = LossTerms(EPSILON, l1_weight=1.0 - weight, structure="ssim", structure_weight=weight)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import operator
+from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from torch import Tensor
@@ -16,6 +16,7 @@ from turbogs_plugin.engine.layout import UNITS
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.strategies.protocols import PixelSampler
 from turbogs_plugin.tiles import TILE_PIXELS, dense_pixels
 from turbogs_plugin.types import PixelSamples, Step
 
@@ -47,15 +48,15 @@ def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
     return numbers
 
 
-class RulePixelSampler:
-    """A sampler described by its rule alone: the engine of the maps' device draws.
+class RulePixelSampler(PixelSampler):
+    """A sampler described by its rule alone: the engine of the maps' device draws."""
 
-    `heeds_masks` says that no masked pixel is drawn. Masked pixels that a sampler without it has drawn are removed
-    afterwards.
-    """
+    heeds_masks = True
 
-    rule: DrawRule
-    heeds_masks: ClassVar[bool] = True
+    @property
+    @abstractmethod
+    def rule(self) -> DrawRule:
+        """The draw as a rule for engines."""
 
     def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
         """Draw the share `rate` (r) of the pixels of each tile or, with `unit: tile`, of the tiles of each view.
@@ -78,15 +79,16 @@ class ErrorGuidedPixelSampler(RulePixelSampler):
     """The paper's sampler: hard units by error, stable ones by age, the rest by both (`engine.reference.draws`).
 
     Args:
-        hard_ratio, stable_ratio: r_hard and r_stable, shares of the units drawn in each tile.
-        mixed: how the remaining share is drawn, which the paper names but does not define: by `error_age`, the mean of
-            the two normalised distributions, or `uniform`.
-        unit: `pixel` (the paper), or `tile` (whole tiles of a view, which begin elsewhere in each iteration:
-            `DrawRule.origin`).
+        hard_ratio: r_hard, share of the units of each tile drawn by error; 0.4 in the paper.
+        stable_ratio: r_stable, share of the units of each tile drawn by age; 0.3 in the paper.
+        mixed: draw of the remaining share, which the paper names but does not define: by `error_age`, the mean of the
+            two normalised distributions, or `uniform`.
+        unit: `pixel`, as in the paper, or `tile`: whole tiles of a view, which begin elsewhere in each iteration
+            (`DrawRule.origin`).
         importance: exponent a of the importance weights p^-a, p the probability that a unit is drawn: 0 none, as in the
             paper's runs; 1 unbiased (exactly so for a draw of a single stage).
-        multiple: of unit `pixel`: a tile gets the nearest multiple of so many. Our rasterizer takes 32 samples at once,
-            and 33 in the time of 64. 1: the paper's number, rounded down.
+        multiple: samples of a tile are rounded to a multiple of this, where `unit` is `pixel`. The rasterizer takes 32
+            samples at once, and 33 in the time of 64. 1: the paper's number, rounded down.
     """
 
     hard_ratio: float = 0.4
@@ -113,10 +115,11 @@ class ErrorGuidedPixelSampler(RulePixelSampler):
 
 @dataclass
 class RandomPixelSampler(RulePixelSampler):
-    """Uniformly random units of each tile (or tiles of each view), without replacement.
+    """Uniformly random pixels of each tile (or tiles of each view), without replacement.
 
     Args:
-        unit, multiple: as in `ErrorGuidedPixelSampler`.
+        unit: `pixel`, or `tile`: whole tiles of a view.
+        multiple: samples of a tile are rounded to a multiple of this (`ErrorGuidedPixelSampler`).
     """
 
     unit: str = "pixel"
@@ -133,10 +136,10 @@ class RandomPixelSampler(RulePixelSampler):
 
 
 @dataclass
-class DensePixelSampler:
+class DensePixelSampler(PixelSampler):
     """Every pixel of the chosen views that is not masked, whatever the rate."""
 
-    heeds_masks: ClassVar[bool] = True
+    heeds_masks = True
 
     def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
         view_ids = view_numbers(view_ids, maps)

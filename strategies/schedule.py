@@ -25,15 +25,19 @@ from turbogs_plugin.types import SamplingBudget, Step
 EPSILON = 1e-12
 """Added to the initial error, which is zero where the initial model is already exact."""
 
+STEEPNESS = 3.0
+"""Steepness of the exponential modulation, which the paper does not give."""
+
 
 @dataclass
 class _AdaptiveSchedule:
     """The appendix's equations; subclasses give `phi`.
 
     Args:
-        min_views, max_views: K_min and K_max.
-        pixel_budget: lambda, the pixels of one iteration in full images.
-        alpha: how fast K falls from K_max to K_min.
+        min_views: K_min, fewest views of an iteration; 3 in the paper.
+        max_views: K_max, most views of an iteration; 10 in the paper.
+        pixel_budget: lambda, the pixels of one iteration in full images; (0, 1] in the paper.
+        alpha: rate at which K falls from K_max to K_min; 3 in the paper.
     """
 
     min_views: int = 3
@@ -86,19 +90,13 @@ class LinearSchedule(_AdaptiveSchedule):
 
 @dataclass
 class ExponentialSchedule(_AdaptiveSchedule):
-    """phi(ratio) = (1 - exp(-steepness * ratio)) / (1 - exp(-steepness)).
+    """phi(ratio) = (1 - exp(-3 ratio)) / (1 - exp(-3)).
 
     The paper names an exponential variant but gives no equation. This one saturates and passes (0, 0) and (1, 1).
     """
 
-    steepness: float = 3.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive(self, "steepness")
-
     def phi(self, ratio: float) -> float:
-        return math.expm1(-self.steepness * ratio) / math.expm1(-self.steepness)
+        return math.expm1(-STEEPNESS * ratio) / math.expm1(-STEEPNESS)
 
 
 @dataclass
@@ -106,7 +104,7 @@ class FixedSchedule:
     """The same K at every iteration, and r = lambda / K.
 
     Args:
-        views: K.
+        views: K, views of an iteration.
         pixel_budget: lambda, the pixels of one iteration in full images.
     """
 

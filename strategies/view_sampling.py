@@ -28,7 +28,7 @@ class RandomViewSampler:
     They come from a shuffled stack. Drawn views leave it, and it is filled again when fewer than K are left.
     """
 
-    stack: np.ndarray | None = field(init=False, repr=False, default=None)  # the views left, int64
+    stack: np.ndarray = field(init=False, repr=False, compare=False)  # the views left, int64
     num_views: int = field(init=False, repr=False, default=0)  # V
 
     def setup(self, cameras: Cameras, scene_extent: float) -> None:
@@ -42,7 +42,7 @@ class RandomViewSampler:
 
     def _fill(self, count: int, step: Step) -> int:
         """Fill the stack again if it holds fewer than `count` views. Returns `count`, at most V."""
-        if self.stack is None:
+        if self.num_views == 0:
             raise RuntimeError("a view sampler needs setup(cameras, scene_extent) before it is used")
         count = min(count, self.num_views)
         if len(self.stack) < count:
@@ -71,8 +71,8 @@ class GeometryAwareViewSampler(RandomViewSampler):
     views leave the stack.
 
     Args:
-        distance_weight: lambda_d, per scene extent.
-        direction_weight: lambda_theta.
+        distance_weight: lambda_d, weight of the distance between cameras, in scene extents; the paper gives no value.
+        direction_weight: lambda_theta, weight of the turn between cameras; the paper gives no value.
     """
 
     distance_weight: float = 2.0

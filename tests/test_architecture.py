@@ -11,7 +11,6 @@ import torch
 
 import turbogs_plugin
 from turbogs_plugin import strategies
-from turbogs_plugin.config import registry
 from turbogs_plugin.scene import write_demo_capture
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -63,10 +62,8 @@ def test_a_package_has_what_it_exports(package):
 
 
 def test_every_built_in_strategy_is_exported():
-    built_in = {name for names in registry.BUILT_IN.values() for name in names.values()}
-    assert built_in <= set(strategies.__all__)
-    protocols = {protocol.__name__ for protocol in registry.PROTOCOLS.values()}
-    assert protocols <= set(strategies.__all__)
+    built_in = {place.partition(":")[2] for types in strategies.TYPES.values() for place in types.values()}
+    assert built_in | {*strategies.PROTOCOLS.values()} <= set(strategies.__all__)
 
 
 def test_readmes_three_lines(tmp_path):

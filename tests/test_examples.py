@@ -19,7 +19,8 @@ import torch
 from helpers.framework_runs import thin_out_points
 from PIL import Image
 
-from turbogs_plugin.config.configuration import load_config, registry
+from turbogs_plugin.config.components import build
+from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene, load_scene, write_demo_capture
@@ -169,16 +170,16 @@ def test_third_party_strategies_are_named_in_a_yaml(third_party, thin_capture, t
 
 def test_third_party_fields_are_checked_like_our_own(third_party):
     with pytest.raises(InputError, match=r"field_sise.*field_size"):
-        registry.build("pixel_sampler", {"type": "checkerboard", "field_sise": 2})
+        build("pixel_sampler", {"type": "checkerboard", "field_sise": 2})
     with pytest.raises(InputError, match="least_opacity"):
-        registry.build("density", {"type": "opaque_only", "least_opacity": 2.0})
+        build("density", {"type": "opaque_only", "least_opacity": 2.0})
 
 
 def test_checkerboards_of_two_iterations_are_every_pixel_once(third_party):
     from turbogs_plugin.error_maps import ErrorMaps
     from turbogs_plugin.types import Step
 
-    sampler = registry.build("pixel_sampler", {"type": "checkerboard", "field_size": 3})
+    sampler = build("pixel_sampler", {"type": "checkerboard", "field_size": 3})
     maps = ErrorMaps.from_images(torch.zeros(1, 21, 37))
     seen = []
     for iteration in range(2):
@@ -194,7 +195,7 @@ def test_checkerboards_of_two_iterations_are_every_pixel_once(third_party):
 
 def test_not_installed_it_is_not_known():
     with pytest.raises(InputError, match=r"unknown pixel_sampler\.type 'checkerboard'"):
-        registry.build("pixel_sampler", {"type": "checkerboard"})
+        build("pixel_sampler", {"type": "checkerboard"})
     assert importlib.util.find_spec("patchwork_strategies") is None
 
 

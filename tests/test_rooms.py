@@ -24,6 +24,7 @@ def test_few_modules_stand_beside_the_packages():
         "error_maps",
         "files",
         "device",
+        "yaml_json",
         "cli",
         "doctor",
         "__main__",

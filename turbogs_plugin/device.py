@@ -1,12 +1,10 @@
-"""Devices as a whole: wait for them, their current streams, measure their peak memory, free what is unused, count the
-processor's cores."""
+"""Devices as a whole: wait for them, measure their peak memory, free what is unused, count the processor's cores."""
 
 from __future__ import annotations
 
 import gc
 import os
 import sys
-from functools import lru_cache
 
 import torch
 
@@ -15,21 +13,6 @@ def synchronize(device: torch.device) -> None:
     """Wait for the GPU, so that a clock read next counts what was asked for; nothing on a CPU."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-
-
-def current_stream(device: torch.device) -> torch.cuda.Stream:
-    """torch's current stream of a GPU that has been used before.
-
-    `torch.cuda.current_stream` makes an object at each call, which takes the host longer than to record an event. Here
-    the object of a stream is made once.
-    """
-    index = torch.cuda.current_device() if device.index is None else device.index
-    return _stream(*torch._C._cuda_getCurrentStream(index))
-
-
-@lru_cache(maxsize=64)
-def _stream(stream_id: int, device_index: int, device_type: int) -> torch.cuda.Stream:
-    return torch.cuda.Stream(stream_id=stream_id, device_index=device_index, device_type=device_type)
 
 
 def processor_cores() -> int:
@@ -45,8 +28,8 @@ def free_device_memory(device: torch.device) -> None:
 
 
 def memory_bytes(device: torch.device) -> int:
-    """Of the tensors on a GPU now, without the memory that processes share (`distributed.peer_memory`), or the peak of
-    this process on a CPU. Does not wait for the GPU."""
+    """Memory of the tensors on a GPU now, without what processes share (`distributed.peer_memory`); on a CPU, the peak
+    of this process. Does not wait for the GPU."""
     return torch.cuda.memory_allocated(device) if device.type == "cuda" else peak_memory_bytes(device)
 
 

@@ -20,7 +20,6 @@ REQUIREMENTS = (
     "filelock>=3.12",
     "scipy>=1.10",
     "trimesh>=4.0",
-    "omegaconf>=2.3",
     "tyro>=0.9",
     "rich>=13.0",
     "matplotlib>=3.8",

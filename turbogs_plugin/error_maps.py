@@ -25,7 +25,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.device import current_stream
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.types import PixelSamples, Step
@@ -78,7 +77,8 @@ class ErrorMaps:
         self._allocate()
         self.view_sums = torch.zeros(len(self.sizes), dtype=torch.float64, device=self.device)
         self._means = _LaggedCopy(self.view_sums, self.refresh)
-        self._sums_read, self._view_means = None, np.zeros(0)  # the latest means, and the sums that they are of
+        self._sums_read: np.ndarray | None = None
+        self._view_means = np.zeros(0)  # the latest means, and the sums that they are of
 
     def _allocate(self) -> None:
         self.offsets = np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1))])  # [V + 1]
@@ -287,7 +287,7 @@ class _LaggedCopy:
                 self.copy = buffer, torch.cuda.Event()
             buffer, event = self.copy
             buffer.copy_(self.source, non_blocking=True)
-            event.record(current_stream(self.source.device))
+            event.record(torch.cuda.current_stream(self.source.device))
         self.reads += 1
         return self.values
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
 import math
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 
 class InputError(ValueError):
@@ -35,6 +36,14 @@ def require_not_negative(instance: object, *fields: str) -> None:
     for field in fields:
         value = getattr(instance, field)
         require(math.isfinite(value) and value >= 0, field, value, "a finite number >= 0")
+
+
+def nearest(name: object, known: Iterable[str]) -> str:
+    """A hint for an unknown name: the nearest known one, where one is near, and all of them."""
+    known = sorted(known)
+    close = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
+    all_known = ", ".join(known) or "none"
+    return f"did you mean '{close[0]}'? (known: {all_known})" if close else f"known are {all_known}"
 
 
 def refusal(error: OSError) -> str:

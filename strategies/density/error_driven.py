@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_settings, require_share
-from turbogs_plugin.strategies.density.priority import drawn_by_squares, squares_of
+from turbogs_plugin.strategies.density.growth import drawn_by_squares, split_in_two, squares_of
 from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, keep_one, removal
-from turbogs_plugin.strategies.density.splitting import split_in_two
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 EPS = 1e-12
@@ -46,43 +44,50 @@ class ErrorDrivenDensity(WindowedDensity):
     At least one Gaussian is always left.
 
     Args:
-        lambda_base: weight of the distance term.
-        score: as in the equation (`raw`), or with e and d each divided by its mean over the seen Gaussians
+        lambda_base: weight of the distance term in the score; 0.8 in the paper.
+        score: difficulty as in the equation (`raw`), or with e and d each divided by its mean over the seen Gaussians
             (`balanced`), so that both count: d is of order 1 and e of order 0.1.
-        refine_from, refine_every: first iteration and interval of densification (tau_from, Delta_dens).
-        grad_threshold, absgrad_threshold: thresholds of the screen gradient and of its absolute variant, means over
-            views (tau_grad, tau_grad_abs), in gsplat's units. Passing one of them suffices.
-        top_fraction: the most difficult share of the seen Gaussians, which may be densified (eta_topk).
-        percent_dense: clone where the largest standard deviation <= this * scene extent, else split (rho_dense).
+        refine_from: first iteration of densification, tau_from; 200 in the paper.
+        refine_every: interval of densification, Delta_dens; 100 .. 350 in the paper.
+        grad_threshold: least screen gradient of what is densified, a mean over views in gsplat's units, tau_grad;
+            1e-4 .. 2e-4 in the paper. Passing this or the next suffices.
+        absgrad_threshold: least absolute screen gradient of what is densified, in the units of `grad_threshold`,
+            tau_grad_abs; 2e-4 .. 4e-4 in the paper.
+        top_fraction: share of the seen Gaussians, the most difficult, which may be densified, eta_topk; 0.5 .. 0.95 in
+            the paper.
+        percent_dense: largest standard deviation of what is cloned, in scene extents, rho_dense; larger ones are split.
+            0.001 .. 0.02 in the paper.
         split: two draws from the Gaussian, all axes divided by 1.6 as in 3DGS (`sample`); or two halves along its
             longest axis, which is divided by 1.6, placed so that the pair has the parent's mean and covariance
             (`long_axis`).
-        max_gaussians: never more than this once the last event is over; before, as many more as the final prunings that
-            are to come take away (`bound`). A model that has more is reduced at the next event: those of least worth
+        max_gaussians: most Gaussians once the last event is over; before, as many more as the final prunings that are
+            to come take away (`bound`). A model that has more is reduced at the next event: Gaussians of least worth
             (`choose_by`) are removed first, those beyond `spare_beyond` last. 0: no cap.
-        prune_opacity: less opaque Gaussians are pruned.
-        prune_world_size: pruned where the largest standard deviation exceeds this * `prune_world_reference`. 0: off.
-        prune_world_reference: the scene extent, as in 3DGS (`extent`). With `distance`, a Gaussian farther than that
-            from the cameras' centre is compared with its distance from there, so it may be larger.
-        prune_screen_size: pruned where the screen radius exceeds this * the larger side of the image. 0: off;
-            3DGS has such a rule, which never takes effect there.
-        prune_size_from: both size rules begin at this share of `refine_until`; 3DGS: iteration 3000 of 15,000.
-        prune_score_fraction: turnover: the share of the Gaussians (seen, and not spared by `spare_beyond`) that each
+        prune_world_reference: length that bounds the size of a Gaussian (`prune_world_size`): the scene extent, as in
+            3DGS (`extent`). With `distance`, a Gaussian farther than that from the cameras' centre is compared with its
+            distance from there, so it may be larger.
+        prune_score_fraction: turnover: share of the Gaussians (seen, and not spared by `spare_beyond`) that each
             densification event removes before it adds any: those with the least score or squares, by `choose_by`. 0:
             off; the paper gives no value.
         opacity_decay: share of its opacity that every Gaussian loses at each densification event. If the photos need
             it, it grows back; if not, it falls below `prune_opacity`. A gentle substitute for 3DGS's reset.
-        spare_beyond: Gaussians farther from the cameras' centre than this * scene extent are neither decayed nor pruned
-            (unless they are not finite, or `max_gaussians` leaves no other choice). It protects a backdrop behind the
-            scene, which few photos see. 0: none.
-        choose_by: which Gaussians grow and which are removed. `difficulty`, the paper's: all grow that pass the
+        spare_beyond: distance from the cameras' centre, in scene extents, beyond which Gaussians are neither decayed
+            nor pruned (unless they are not finite, or `max_gaussians` leaves no other choice). It protects a backdrop
+            behind the scene, which few photos see. 0: none.
+        choose_by: rule by which Gaussians grow and are removed. `difficulty`, the paper's: all grow that pass the
             thresholds, or the most difficult of them where `max_gaussians` has no room for all; the easiest are removed
-            first. `squares` (see `priority`): as many grow as pass the threshold of the absolute gradient; which ones
+            first. `squares` (see `growth`): as many grow as pass the threshold of the absolute gradient; which ones
             is drawn at random among those seen, in proportion to their squares. Those with the least squares are
             removed first. `grad_threshold`, `top_fraction`, `score` and `lambda_base` then mean nothing.
-        final_every, final_keep: interval of the final pruning, and the share of those seen and not spared that it keeps
-            (Delta_prune, eta_final). 1 keeps all. There are `FINAL_PRUNINGS` at most, the last one half an interval or
-            more before the end.
+        final_every: interval of the final pruning, Delta_prune; 500 in the paper. There are `FINAL_PRUNINGS` at most,
+            the last one half an interval or more before the end.
+        final_keep: share of the Gaussians, seen and not spared, that a final pruning keeps, eta_final; 0.8 .. 0.95 in
+            the paper. 1 keeps all.
+        prune_opacity: opacity below which Gaussians are pruned. This and the following are 3DGS's values, no settings.
+        prune_world_size: largest standard deviation of a Gaussian over `prune_world_reference`. 0: off.
+        prune_screen_size: largest screen radius of a Gaussian over the larger side of the image. 0: off; 3DGS has such
+            a rule, which never takes effect there.
+        prune_size_from: share of `refine_until` at which both size rules begin; 3DGS: iteration 3000 of 15,000.
     """
 
     lambda_base: float = 0.8
@@ -95,17 +100,17 @@ class ErrorDrivenDensity(WindowedDensity):
     percent_dense: float = 0.01
     split: Literal["sample", "long_axis"] = "sample"
     max_gaussians: int = 0
-    prune_opacity: float = 0.005
-    prune_world_size: float = 0.1
     prune_world_reference: Literal["extent", "distance"] = "extent"
-    prune_screen_size: float = 0.0
-    prune_size_from: float = 0.2
     prune_score_fraction: float = 0.0
     opacity_decay: float = 0.0
     spare_beyond: float = 0.0
     choose_by: Literal["difficulty", "squares"] = "difficulty"
     final_every: int = 500
     final_keep: float = 0.95
+    prune_opacity: float = field(default=0.005, metadata={"setting": False})
+    prune_world_size: float = field(default=0.1, metadata={"setting": False})
+    prune_screen_size: float = field(default=0.0, metadata={"setting": False})
+    prune_size_from: float = field(default=0.2, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         require_at_least_one(self, "refine_every", "final_every")
@@ -132,14 +137,9 @@ class ErrorDrivenDensity(WindowedDensity):
             self._stats = None
         return update
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        if self.choose_by == "squares" and state["stats"] is not None and "square_sums" not in state["stats"]:
-            raise InputError("choose_by = squares, but the saved state has no squares: start a new run")
-        super().load_state_dict(state)
-
     def scores(self, step: Step) -> tuple[Tensor, Tensor]:
         """([N] difficulty score, [N] bool seen) of the present window. The score 0 of an unseen one has no meaning."""
-        stats, seen = self._stats, self._seen()
+        stats, seen = self.window, self._seen()
         errors, distances = (
             torch.where(seen, sums / (stats.weight_sums + EPS), 0.0) for sums in (stats.error_sums, stats.distance_sums)
         )
@@ -193,7 +193,7 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def _seen(self) -> Tensor:
         """[N] bool: with a weight in the present window, and finite sums."""
-        stats = self._stats
+        stats = self.window
         weights = stats.weight_sums
         return (weights > 0) & torch.isfinite(weights + stats.error_sums + stats.distance_sums)
 
@@ -205,7 +205,7 @@ class ErrorDrivenDensity(WindowedDensity):
         sound = finite & (torch.sigmoid(gaussians.opacities) >= self.prune_opacity)
         if self.prune_score_fraction > 0:
             sound &= ~_lowest(worth, known & seen & ~spared, self.prune_score_fraction)
-        keys = drawn_by_squares(self._stats, step) if self.choose_by == "squares" else worth
+        keys = drawn_by_squares(self.window, step) if self.choose_by == "squares" else worth
         order = _descending(keys)  # who grows first
         candidates = self._passing(worth, seen) & sound
         if self.choose_by == "squares":
@@ -224,7 +224,7 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def _passing(self, worth: Tensor, seen: Tensor) -> Tensor:
         """[N] bool, which pass the gates: a high screen gradient and, by difficulty, a high score."""
-        stats = self._stats
+        stats = self.window
         views = stats.view_counts.clamp(min=1)
         absolute = seen & (stats.absgrad_sums / views > self.absgrad_threshold)
         if self.choose_by == "squares":
@@ -246,7 +246,7 @@ class ErrorDrivenDensity(WindowedDensity):
             limit = self.prune_world_size * reference
         oversized = largest > limit
         if begun and self.prune_screen_size > 0:
-            oversized |= self._stats.max_radii > self.prune_screen_size
+            oversized |= self.window.max_radii > self.prune_screen_size
         return oversized
 
     def _worth(self, step: Step) -> tuple[Tensor, Tensor, Tensor]:
@@ -256,7 +256,7 @@ class ErrorDrivenDensity(WindowedDensity):
         squares it is worth least.
         """
         if self.choose_by == "squares":
-            return *squares_of(self._stats), self._seen()
+            return *squares_of(self.window), self._seen()
         score, seen = self.scores(step)
         return score, seen, seen
 

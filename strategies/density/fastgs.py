@@ -8,11 +8,26 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, require_share, shared_settings
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.rows import add_stats, finite_rows, leave_one, loaded_rows, removal, saved_rows
 from turbogs_plugin.strategies.protocols import DensityController
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
+
+ABSGRAD_THRESHOLD, PERCENT_DENSE = 1.2e-3, 0.001
+"""`absgrad_threshold` and `percent_dense` of `ErrorDrivenDensity`; FastGS's values."""
+
+ERROR_THRESHOLD = 1.0
+"""Least mean error of a marked Gaussian in a batch, in units of the batch's mean error."""
+
+CONSISTENCY = 0.5
+"""Least share of the batches that mark a Gaussian, of those that saw it, for it to be densified."""
+
+PRUNE_EVERY = 6
+"""Interval of the pruning after densification, in intervals of densification: 3000 iterations for 500."""
+
+BLAME_THRESHOLD = 0.9
+"""Share of the largest blame above which a Gaussian is pruned."""
 
 
 @dataclass
@@ -33,12 +48,12 @@ class ViewVotes:
     def zeros(cls, count: int, device: torch.device | str) -> ViewVotes:
         return cls(*(torch.zeros(count, device=device) for _ in fields(cls)))
 
-    def add(self, batch: GaussianStats, error_threshold: float) -> None:
+    def add(self, batch: GaussianStats) -> None:
         """Count one batch, given the statistics of its iteration. A Gaussian with non-finite sums was not seen."""
         seen = (batch.weight_sums > 0) & torch.isfinite(batch.weight_sums + batch.error_sums)
         errors, weights = (torch.where(seen, sums, 0.0) for sums in (batch.error_sums, batch.weight_sums))
         mean_error = errors.sum() / weights.sum().clamp(min=1e-12)
-        marked = seen & (errors > error_threshold * mean_error * weights)
+        marked = seen & (errors > ERROR_THRESHOLD * mean_error * weights)
         self.seen += seen
         self.marked += marked
         self.blame += marked * mean_error
@@ -53,36 +68,23 @@ class FastGsDensity(DensityController):
     each Gaussian by the marked pixels in its footprint. For densification the score is their mean number over the
     views; for pruning it is their number times each view's photometric error, normalised. This class keeps these two
     ideas without the extra renders: an event uses the batches of the iterations since the last event. In a batch, a
-    Gaussian is *marked* if its mean error, sum of e * w over sum of w, exceeds `error_threshold` times the batch's mean
+    Gaussian is *marked* if its mean error, sum of e * w over sum of w, exceeds `ERROR_THRESHOLD` times the batch's mean
     error. In ``configs/fastgs.yaml`` a batch is one view.
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, a Gaussian is cloned or split
-    where its screen gradient, or its absolute one, passes the threshold *and* at least `consistency` of the batches
-    that saw it marked it. Transparent and huge ones are pruned. Afterwards, every `prune_every` iterations, transparent
+    where its screen gradient, or its absolute one, passes the threshold *and* at least `CONSISTENCY` of the batches
+    that saw it marked it. Transparent and huge ones are pruned. Afterwards, every `PRUNE_EVERY` intervals, transparent
     ones are pruned. So are those whose blame (the sum of the mean errors of the batches that marked them) exceeds
-    `blame_threshold` of the largest, unless all have that much. Both kinds of event prune Gaussians that are not
+    `BLAME_THRESHOLD` of the largest, unless all have that much. Both kinds of event prune Gaussians that are not
     finite. One Gaussian is always left.
 
     Args:
-        refine_from, refine_every, grad_threshold, absgrad_threshold, percent_dense, prune_opacity, prune_world_size:
-            as in `ErrorDrivenDensity`.
-        error_threshold: threshold of a Gaussian's mean error in a batch, in units of the batch's mean error.
-        consistency: share of the batches that must agree.
-        prune_every: interval of the pruning after densification.
-        blame_threshold: above this share of the largest blame a Gaussian is pruned. 1 prunes none.
+        refine_from: first iteration of densification.
+        refine_every: interval of densification. The interval of the pruning afterwards is `PRUNE_EVERY` times as long.
     """
 
     refine_from: int = 500
     refine_every: int = 500
-    grad_threshold: float = ErrorDrivenDensity.grad_threshold
-    absgrad_threshold: float = 1.2e-3
-    percent_dense: float = 0.001
-    prune_opacity: float = ErrorDrivenDensity.prune_opacity
-    prune_world_size: float = ErrorDrivenDensity.prune_world_size
-    error_threshold: float = 1.0
-    consistency: float = 0.5
-    prune_every: int = 3000
-    blame_threshold: float = 0.9
     watched = ("statistics",)  # an iteration's batch votes by its mean error, over all Gaussians
     _events: ErrorDrivenDensity = field(init=False, repr=False)
     _batch: GaussianStats | None = field(init=False, repr=False, default=None)
@@ -90,12 +92,18 @@ class FastGsDensity(DensityController):
     _votes: ViewVotes | None = field(init=False, repr=False, default=None)
 
     def __post_init__(self) -> None:
-        require_at_least_one(self, "prune_every")
-        require_share(self, "consistency", "blame_threshold")
         require_settings(self)
-        # It carries the events out. The gradients it is given decide which Gaussians may be densified.
-        settings = shared_settings(self, ErrorDrivenDensity)
-        self._events = ErrorDrivenDensity(**settings, score="raw", lambda_base=0.0, top_fraction=1.0, final_keep=1.0)
+        # The events of another controller. The gradients it is given decide which Gaussians may be densified.
+        self._events = ErrorDrivenDensity(
+            refine_from=self.refine_from,
+            refine_every=self.refine_every,
+            absgrad_threshold=ABSGRAD_THRESHOLD,
+            percent_dense=PERCENT_DENSE,
+            score="raw",
+            lambda_base=0.0,
+            top_fraction=1.0,
+            final_keep=1.0,
+        )
 
     @property
     def stats(self) -> GaussianStats | None:
@@ -109,22 +117,23 @@ class FastGsDensity(DensityController):
 
     def _prune_due(self, step: Step) -> bool:
         after = step.iteration - step.refine_until
-        return after > 0 and after % self.prune_every == 0
+        return after > 0 and after % (PRUNE_EVERY * self.refine_every) == 0
 
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        if self._batch is None:
+        batch, window, votes = self._batch, self._window, self._votes
+        if batch is None or window is None or votes is None:
             if not self._over(step):  # a time budget has made the run longer
                 self._restart(len(gaussians), gaussians.device)
             return None
-        self._votes.add(self._batch, self.error_threshold)
-        add_stats(self._window, self._batch)
-        self._batch.zero_()
+        votes.add(batch)
+        add_stats(window, batch)
+        batch.zero_()
         update = None
         if self._events.due(step)[0]:
-            update = self._densify(gaussians, step)
+            update = self._densify(gaussians, step, window, votes)
         elif self._prune_due(step):
-            update = self._prune(gaussians)
+            update = self._prune(gaussians, votes)
         if self.event_due(step):
             self._restart(len(gaussians), gaussians.device)
         if self._over(step):
@@ -133,8 +142,8 @@ class FastGsDensity(DensityController):
 
     def _over(self, step: Step) -> bool:
         """No event is left after this iteration, in a run of the present length."""
-        after = step.iteration - step.refine_until
-        return after > 0 and step.iteration + self.prune_every - after % self.prune_every >= step.total
+        after, interval = step.iteration - step.refine_until, PRUNE_EVERY * self.refine_every
+        return after > 0 and step.iteration + interval - after % interval >= step.total
 
     def apply(self, update: RowUpdate) -> None:
         if self._batch is not None:  # a window starts anew at each event
@@ -154,20 +163,19 @@ class FastGsDensity(DensityController):
         self._batch, self._window = GaussianStats.zeros(count, device), GaussianStats.zeros(count, device)
         self._votes = ViewVotes.zeros(count, device)
 
-    def _densify(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        votes, window = self._votes, self._window
-        agreed = (votes.marked >= self.consistency * votes.seen) & (votes.seen > 0)
+    def _densify(self, gaussians: Gaussians, step: Step, window: GaussianStats, votes: ViewVotes) -> RowUpdate | None:
+        agreed = (votes.marked >= CONSISTENCY * votes.seen) & (votes.seen > 0)
         window.grad_sums *= agreed
         window.absgrad_sums *= agreed
         self._events.setup(gaussians)
         self._events.load_state_dict({"stats": vars(window)})
         return self._events.update(gaussians, step)
 
-    def _prune(self, gaussians: Gaussians) -> RowUpdate | None:
+    def _prune(self, gaussians: Gaussians, votes: ViewVotes) -> RowUpdate | None:
         if len(gaussians) == 0:
             return None
-        blame = self._votes.blame
-        blamed = blame > self.blame_threshold * blame.max()
+        blame = votes.blame
+        blamed = blame > BLAME_THRESHOLD * blame.max()
         blamed &= ~blamed.all()  # all alike: nothing distinguishes them
-        transparent = torch.sigmoid(gaussians.opacities) < self.prune_opacity
+        transparent = torch.sigmoid(gaussians.opacities) < self._events.prune_opacity
         return removal(leave_one(blamed | transparent | ~finite_rows(gaussians), gaussians))

@@ -11,8 +11,7 @@ from gsplat.strategy import DefaultStrategy, Strategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
 
-from turbogs_plugin.errors import require
-from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, shared_settings
+from turbogs_plugin.strategies.checks import require_at_least_one, require_settings
 from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
@@ -35,39 +34,29 @@ class GsplatDefaultDensity(WindowedDensity):
     An event first removes Gaussians that are not finite or too large to be split, on which gsplat would fail or go on
     training with NaN. One Gaussian, the most opaque, is always left.
 
+    All other settings are gsplat's own defaults.
+
     Args:
-        prune_opa, grow_grad2d, grow_scale3d, grow_scale2d, prune_scale3d, prune_scale2d, refine_scale2d_stop_iter,
-            refine_start_iter, reset_every, refine_every, pause_refine_after_reset, absgrad, revised_opacity: as in
-            `gsplat.DefaultStrategy`.
-        opacity_reset: gsplat 1.5.3 never resets opacities (`step % reset_every == 0 & step > 0` is always false).
-            `as_shipped` keeps that; `repaired` resets every `reset_every` iterations, as gsplat's docs say.
+        refine_start_iter: iteration after which densification begins.
+        refine_every: interval of densification.
+        opacity_reset: resets of opacities. gsplat 1.5.3 makes none, as `step % reset_every == 0 & step > 0` is always
+            false: `as_shipped` keeps that; `repaired` resets every `DefaultStrategy.reset_every` iterations, as
+            gsplat's docs say.
     """
 
-    prune_opa: float = 0.005
-    grow_grad2d: float = 0.0002
-    grow_scale3d: float = 0.01
-    grow_scale2d: float = 0.05
-    prune_scale3d: float = 0.1
-    prune_scale2d: float = 0.15
-    refine_scale2d_stop_iter: int = 0
-    refine_start_iter: int = 500
-    reset_every: int = 3000
-    refine_every: int = 100
-    pause_refine_after_reset: int = 0
-    absgrad: bool = False
-    revised_opacity: bool = False
+    refine_start_iter: int = DefaultStrategy.refine_start_iter
+    refine_every: int = DefaultStrategy.refine_every
     opacity_reset: Literal["repaired", "as_shipped"] = "repaired"
 
     def __post_init__(self) -> None:
-        require_at_least_one(self, "refine_every", "reset_every")
-        require(0 <= self.prune_opa < 0.5, "prune_opa", self.prune_opa, "at least 0 and less than 0.5")
+        require_at_least_one(self, "refine_every")
         require_settings(self)
 
     def event_due(self, step: Step) -> bool:
         return step.iteration < step.refine_until and (step.iteration % self.refine_every == 0 or self._reset_due(step))
 
     def _reset_due(self, step: Step) -> bool:
-        return step.iteration > 0 and step.iteration % self.reset_every == 0
+        return step.iteration > 0 and step.iteration % DefaultStrategy.reset_every == 0
 
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
@@ -79,23 +68,28 @@ class GsplatDefaultDensity(WindowedDensity):
         usable = torch.nonzero(finite_rows(gaussians)).squeeze(-1)
         if len(usable) == 0:
             return self._keep_one(gaussians)
-        strategy = _FilledStrategy(**shared_settings(self, DefaultStrategy), refine_stop_iter=step.refine_until)
+        strategy = _FilledStrategy(
+            refine_start_iter=self.refine_start_iter, refine_every=self.refine_every, refine_stop_iter=step.refine_until
+        )
         values = {name: value[usable] for name, value in gaussians.items()}
-        grads = self._stats.absgrad_sums if self.absgrad else self._stats.grad_sums
-        state = {"grad2d": grads, "count": self._stats.view_counts, "radii": self._stats.max_radii}
+        state: dict[str, Any] = {
+            "grad2d": self._stats.grad_sums,
+            "count": self._stats.view_counts,
+            "radii": self._stats.max_radii,
+        }
         state = {name: rows[usable] for name, rows in state.items()}
         # gsplat treats the row numbers as one more running statistic.
         state |= {"source_row": usable, "scene_scale": step.scene_extent}
         params, optimizers = run_gsplat(strategy, values, state, step)
         if reset_due and self.opacity_reset == "repaired":
-            reset_opa(params, optimizers, state, self.prune_opa * 2.0)
+            reset_opa(params, optimizers, state, strategy.prune_opa * 2.0)
         if len(state["source_row"]) == 0:
             return self._keep_one(gaussians)
         return self._change(gaussians, params, optimizers, state)
 
     def _keep_one(self, gaussians: Gaussians) -> RowUpdate | None:
         """Keep only the most opaque finite Gaussian, so that the model is never empty."""
-        self._stats.zero_()
+        self.window.zero_()
         return removal(leave_one(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians))
 
     def _change(self, gaussians: Gaussians, params: dict, optimizers: dict, state: dict) -> RowUpdate | None:
@@ -104,7 +98,7 @@ class GsplatDefaultDensity(WindowedDensity):
         fresh, opacity_fresh = (new_rows(params, optimizers, name) for name in ("means", "opacities"))
         was_reset = bool(opacity_fresh.all()) and not bool(fresh.all())
         if not bool(state["count"].any()):  # gsplat starts a new window after a refinement
-            self._stats.zero_()
+            self.window.zero_()
         if len(source) == len(gaussians) and not was_reset and not bool(fresh.any()):
             return None
         present = torch.bincount(source, minlength=len(gaussians))
@@ -134,7 +128,9 @@ def run_gsplat(
         The parameters afterwards, and optimizers for `new_rows`.
     """
     params = {name: torch.nn.Parameter(value, requires_grad=False) for name, value in values.items()}
-    optimizers = {name: torch.optim.SGD([param], lr=0.0) for name, param in params.items()}
+    optimizers: dict[str, torch.optim.Optimizer] = {
+        name: torch.optim.SGD([param], lr=0.0) for name, param in params.items()
+    }
     for name, param in params.items():  # gsplat puts 0 where it makes or resets rows
         optimizers[name].state[param]["known"] = torch.ones(len(param), device=param.device)
     device = params["means"].device

@@ -8,8 +8,8 @@ import torch
 from gsplat.strategy import MCMCStrategy
 from torch import Tensor
 
-from turbogs_plugin.errors import InputError, require
-from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, shared_settings
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.checks import require_at_least_one, require_settings
 from turbogs_plugin.strategies.density.gsplat_default import new_rows, run_gsplat
 from turbogs_plugin.strategies.density.rows import finite_rows
 from turbogs_plugin.strategies.learning_rates import LearningRates
@@ -36,24 +36,24 @@ class GsplatMcmcDensity(DensityController):
     large, counts as dead. Noise that is not finite is left out. An event without living Gaussians relocates and adds
     none.
 
+    All other settings are gsplat's own defaults.
+
     Args:
-        max_gaussians: `cap_max` of `gsplat.MCMCStrategy`.
-        noise_lr, refine_start_iter, refine_every, min_opacity: as in `gsplat.MCMCStrategy`.
-        learning_rates: those of the optimizer. The noise uses the means' rate of the next iteration, as in gsplat's
-            trainer, where the schedulers step first.
+        max_gaussians: most Gaussians, `cap_max` of `gsplat.MCMCStrategy`.
+        refine_start_iter: iteration after which Gaussians are relocated and added.
+        refine_every: interval of relocation and growth.
+        learning_rates: learning rates of the optimizer. The noise uses the means' rate of the next iteration, as in
+            gsplat's trainer, where the schedulers step first.
     """
 
     max_gaussians: int = 1_000_000
-    noise_lr: float = 5e5
-    refine_start_iter: int = 500
-    refine_every: int = 100
-    min_opacity: float = 0.005
+    refine_start_iter: int = MCMCStrategy.refine_start_iter
+    refine_every: int = MCMCStrategy.refine_every
     learning_rates: LearningRates = field(default_factory=LearningRates)
     watched = ("model",)  # its noise
 
     def __post_init__(self) -> None:
         require_at_least_one(self, "max_gaussians", "refine_every")
-        require(0 < self.min_opacity < 1, "min_opacity", self.min_opacity, "more than 0 and less than 1")
         require_settings(self)
 
     def setup(self, gaussians: Gaussians) -> None:
@@ -72,7 +72,7 @@ class GsplatMcmcDensity(DensityController):
             return None
         if self.event_due(step):
             usable = finite_rows(gaussians) & (gaussians.scales.amax(dim=-1) <= LARGEST_LOG_SCALE)
-            if bool((usable & (torch.sigmoid(gaussians.opacities) > self.min_opacity)).any()):
+            if bool((usable & (torch.sigmoid(gaussians.opacities) > MCMCStrategy.min_opacity)).any()):
                 return self._refine(gaussians, usable, step)
         self._add_noise(gaussians, step)
         return None
@@ -104,8 +104,12 @@ class GsplatMcmcDensity(DensityController):
 
     def _run_gsplat(self, values: dict[str, Tensor], refine_until: int, step: Step) -> tuple[dict, dict]:
         """`run_gsplat` with gsplat's strategy and these settings."""
-        settings = shared_settings(self, MCMCStrategy)
-        strategy = MCMCStrategy(**settings, cap_max=self.max_gaussians, refine_stop_iter=refine_until)
+        strategy = MCMCStrategy(
+            cap_max=self.max_gaussians,
+            refine_start_iter=self.refine_start_iter,
+            refine_stop_iter=refine_until,
+            refine_every=self.refine_every,
+        )
         rate = self.learning_rates.at(replace(step, iteration=step.iteration + 1)).means
         # gsplat's state is a table for relocation, which takes longer to make than an iteration.
         state = strategy.initialize_state() if refine_until > 0 else {"binoms": torch.empty(0)}

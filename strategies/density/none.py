@@ -14,7 +14,7 @@ class NoDensity(DensityController):
     """The set of Gaussians stays as it is.
 
     Args:
-        max_gaussians: cap on the initial number of Gaussians. 0: no cap.
+        max_gaussians: most initial Gaussians. 0: no cap.
     """
 
     max_gaussians: int = 0

@@ -13,10 +13,6 @@ from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate
 
 RowsType = TypeVar("RowsType")  # a dataclass of [N] tensors
 
-ADDED = ("square_sums",)
-"""Statistics that a state from another trainer may lack. They begin at zero; `choose_by: squares` refuses such a state.
-Checkpoints of runs are refused before (`checkpoint.require_like`)."""
-
 
 class WindowedDensity(DensityController):
     """A density control that keeps the statistics of a window of iterations, until it needs no more of them."""
@@ -25,6 +21,15 @@ class WindowedDensity(DensityController):
 
     @property
     def stats(self) -> GaussianStats | None:
+        return self._stats
+
+    @property
+    def window(self) -> GaussianStats:
+        """The statistics. Raises RuntimeError, an error of the caller's code, where none are kept."""
+        if self._stats is None:
+            raise RuntimeError(
+                "density control keeps no statistics: call setup before, and nothing after its last event"
+            )
         return self._stats
 
     def setup(self, gaussians: Gaussians) -> None:
@@ -75,9 +80,7 @@ def loaded_rows(name: str, saved: dict[str, Tensor] | None, present: RowsType | 
                 f"density {name}.{key} has shape {tuple(value.shape)}, expected {tuple(like.shape)}: "
                 "load the state together with its own model"
             )
-    loaded = {key: value.to(like.device, copy=True) for key, value in saved.items()}
-    absent = {key: torch.zeros_like(like) for key in ADDED if hasattr(present, key) and key not in saved}
-    return type(present)(**loaded, **absent)
+    return type(present)(**{key: value.to(like.device, copy=True) for key, value in saved.items()})
 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:

@@ -9,11 +9,15 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from turbogs_plugin.engine.moments import check_moments_config, check_state
+from turbogs_plugin.engine.moments import check_state
 from turbogs_plugin.engine.reference.update import clipped, finite_gradients
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, RowUpdate, Step
+
+OPTIONS: dict[str, Any] = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15}
+OPTIONS |= {"weight_decay": 0.0, "amsgrad": False, "maximize": False}
+"""Adam's options, gsplat's values: decays of the moments, and eps, which is added to sqrt(v)."""
 
 
 @dataclass
@@ -34,9 +38,7 @@ class DenseAdam:
     untouched, and counted.
 
     Args:
-        learning_rates: of each parameter over the run.
-        beta1, beta2: decay of the moments.
-        eps: added to sqrt(v); gsplat's value.
+        learning_rates: rate of each parameter over the run.
         opacity_reg: weight of the mean opacity, after the sigmoid, in the objective.
         scale_reg: weight of the mean standard deviation, world units, in the objective. Both are terms of the loss of
             3DGS-MCMC (Kheradmand et al. 2024; 0.01 each in gsplat's trainer). A `SparseLoss` sees only colours, so the
@@ -44,9 +46,6 @@ class DenseAdam:
     """
 
     learning_rates: LearningRates = field(default_factory=LearningRates)
-    beta1: float = 0.9
-    beta2: float = 0.999
-    eps: float = 1e-15
     opacity_reg: float = 0.0
     scale_reg: float = 0.0
     moments = None  # only an `UpdateRule` has them; here torch keeps its own
@@ -57,7 +56,6 @@ class DenseAdam:
     skipped: Tensor = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        check_moments_config(self.beta1, self.beta2, self.eps)
         require_settings(self)
 
     def setup(self, gaussians: Gaussians) -> None:
@@ -77,8 +75,6 @@ class DenseAdam:
         rates = self.learning_rates.at(step)
         # Torch's way of skipping an iteration without waiting for the device.
         nothing = (~touched.any()).to(torch.float32)
-        options = {"beta1": self.beta1, "beta2": self.beta2, "eps": self.eps}
-        options |= {"weight_decay": 0.0, "amsgrad": False, "maximize": False}
         for count, (name, parameter) in zip(self.counts.unbind(), gaussians.items(), strict=True):
             gradient = gradients.summed(name)  # in the parameter's own shape
             rows = finite.reshape(-1, *[1] * (gradient.dim() - 1))
@@ -89,8 +85,8 @@ class DenseAdam:
             if name == "scales" and self.scale_reg > 0:
                 gradient += clipped(self.scale_reg / max(1, parameter.numel()) * parameter.exp())
             exp_avg, exp_avg_sq = (getattr(moments, name) for moments in (self.exp_avg, self.exp_avg_sq))
-            lists = ([value] for value in (parameter, gradient, exp_avg, exp_avg_sq))
-            adam(*lists, [], [count], fused=True, found_inf=nothing, lr=getattr(rates, name), **options)
+            options = {"fused": True, "found_inf": nothing, "lr": getattr(rates, name), **OPTIONS}
+            adam([parameter], [gradient], [exp_avg], [exp_avg_sq], [], [count], **options)
 
     def apply(self, update: RowUpdate) -> None:
         for moments in (self.exp_avg, self.exp_avg_sq):
@@ -100,7 +96,7 @@ class DenseAdam:
                 getattr(moments, name).zero_()
 
     def state_dict(self) -> dict[str, Any]:
-        state = {}
+        state: dict[str, Any] = {}
         for moment in ("exp_avg", "exp_avg_sq"):
             state |= {f"{moment}.{name}": value for name, value in getattr(self, moment).items()}
         return {**state, "counts": self.counts, "skipped": self.skipped}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from turbogs_plugin.engine.rules import MomentLMParams
@@ -33,22 +33,21 @@ class MomentLMOptimizer(SparseAdam):
     g_k as rows of J. It has no learning rate and depends on the unit of the loss. It is there for comparison.
 
     Args:
-        learning_rates, beta1, beta2: as in `SparseAdam`.
-        eps: added to sqrt(v). The default is so small that a loss scaled by 1e-6 gives the same steps down to gradients
+        eps: added to sqrt(v); no setting. So small that a loss scaled by 1e-6 gives the same steps down to gradients
             of 1e-12. It is not below what v can hold: where g^2 underflows in float32 (|g| < 1.2e-21), m / eps is still
             less than one.
-        units: see above.
-        rows: J has one row per view, or one row, their sum (rank 1).
-        curvature: if L_k were true shares, 1/2 would be Gauss-Newton for a loss r^2 / 2, and 1 Gauss-Newton for |r|
-            (iteratively reweighted). With the L_k above and a mean over channels, the default of 0.5 acts as 1/6.
-            `balanced` only.
-        max_step: no entry of delta exceeds this many learning rates, or Adam's own entry where that is longer. Coupling
-            can move a parameter whose own gradient is near zero so far that the linear model no longer holds. 1 is
-            the length of Adam's step for gradients that always agree; 0 turns the bound off. `balanced` only, as the
-            printed equation has no learning rates.
+        units: the system that is solved, `balanced` or the printed one, `paper`.
+        rows: rows of J: one per view, or one, their sum (rank 1).
+        curvature: weight of the rows' term. If L_k were true shares, 1/2 would be Gauss-Newton for a loss r^2 / 2, and
+            1 Gauss-Newton for |r| (iteratively reweighted). With the L_k above and a mean over channels, 0.5 acts as
+            1/6. `balanced` only.
+        max_step: largest entry of delta in learning rates, or Adam's own entry where that is longer. Coupling can move
+            a parameter whose own gradient is near zero so far that the linear model no longer holds. 1 is the length of
+            Adam's step for gradients that always agree; 0 turns the bound off. `balanced` only, as the printed equation
+            has no learning rates.
     """
 
-    eps: float = 1e-20
+    eps: float = field(default=1e-20, metadata={"setting": False})
     units: Literal["balanced", "paper"] = "balanced"
     rows: Literal["views", "summed"] = "views"
     curvature: float = 0.5

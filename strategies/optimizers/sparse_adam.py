@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 from torch import Tensor
 
@@ -24,22 +24,30 @@ class SparseAdam:
     An optimizer with another `rule` on the same moments inherits from this one, as `MomentLMOptimizer` does.
 
     Args:
-        learning_rates: of each parameter over the run.
-        beta1, beta2: decay of the moments.
-        eps: added to sqrt(v). 3DGS's value: gradients of a mean loss over a million pixels are far below Adam's
-            customary 1e-8.
+        learning_rates: rate of each parameter over the run.
+        beta1: decay of the first moment.
+        beta2: decay of the second moment.
+        eps: added to sqrt(v); no setting. 3DGS's value: gradients of a mean loss over a million pixels are far below
+            Adam's customary 1e-8.
     """
 
     learning_rates: LearningRates = field(default_factory=LearningRates)
     beta1: float = 0.9
     beta2: float = 0.999
-    eps: float = 1e-15
+    eps: float = field(default=1e-15, metadata={"setting": False})
     moments: GaussianMoments = field(init=False, repr=False)
-    per_view = False
-    lm: ClassVar[MomentLMParams | None] = None  # of the rule
 
     def __post_init__(self) -> None:
         check_moments_config(self.beta1, self.beta2, self.eps)
+
+    @property
+    def per_view(self) -> bool:
+        return False
+
+    @property
+    def lm(self) -> MomentLMParams | None:
+        """The damped system of the rule, or None for Adam's step."""
+        return None
 
     @property
     def skipped(self) -> Tensor:

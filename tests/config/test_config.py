@@ -1,15 +1,23 @@
 """Configuration: dataclasses <- YAML <- overrides, strictly."""
 
-from pathlib import Path
+import itertools
 
 import pytest
 
-from turbogs_plugin.config.configuration import apply_overrides, config_names, load_config, registry, resolve
-from turbogs_plugin.config.yaml_text import DEPTH_LIMIT, SIZE_LIMIT, parse_yaml
+from turbogs_plugin.config.components import KINDS
+from turbogs_plugin.config.configuration import (
+    apply_overrides,
+    config_names,
+    load_config,
+    require_one_length,
+    resolve,
+    resolve_complete,
+)
+from turbogs_plugin.config.listing import all_settings, settings_text
+from turbogs_plugin.config.sections import parse_bytes, parse_seconds
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.grid import load_ablation
-
-ROOT = Path(__file__).resolve().parents[2]
+from turbogs_plugin.yaml_json import DEPTH_LIMIT, SIZE_LIMIT, parse_json, parse_yaml
 
 
 @pytest.fixture
@@ -25,22 +33,16 @@ def write(tmp_path):
 def test_packaged_configurations_are_complete_and_round_trip(name):
     config = load_config(name)
     assert resolve(parse_yaml(config.to_yaml(), name)) == config
-    for kind in registry.KINDS:
+    for kind in KINDS:
         config.build(kind)
 
 
-def test_the_names_of_the_issue_are_packaged():
-    assert {"turbogs", "turbogs-big", "turbogs-ssim", "turbogs-paper", "demo"} <= set(config_names())
-
-
 def test_the_table_of_the_paper():
-    fast, big = load_config("turbogs"), load_config("turbogs-big")
-    assert (fast.train.base_iterations, fast.train.refine_until) == (5000, 3500)
-    assert (big.train.base_iterations, big.train.refine_until) == (8000, 6000)
-    for config in (fast, big):
-        assert config.schedule["type"] == "sinusoidal"
-        assert (config.schedule["min_views"], config.schedule["max_views"], config.schedule["alpha"]) == (3, 10, 3.0)
-        assert config.maps.beta == 0.4
+    for name, iterations, until in (("turbogs", 5000, 3500), ("turbogs-big", 8000, 6000)):
+        config = load_config(name)
+        assert config.train.refine_until == until * config.train.written_iterations / iterations
+        assert (config.schedule["type"], config.schedule["alpha"], config.maps.beta) == ("sinusoidal", 3.0, 0.4)
+        assert (config.schedule["min_views"], config.schedule["max_views"]) == (3, 10)
 
 
 @pytest.mark.parametrize("ablation", ["sizes", "cameras"])
@@ -86,11 +88,15 @@ BAD_OVERRIDES = [
     ("trian.iterations=5", ["trian", "did you mean 'train'?"]),
     ("schedule.min_view=5", ["schedule.min_view", "did you mean 'min_views'?"]),
     ("schedule.type=sinus", ["sinus", "did you mean 'sinusoidal'?", "fixed"]),
+    ("pixel_sampler.tpe=random", ["pixel_sampler.tpe", "did you mean 'type'?"]),
     ("optimizer.learning_rates.mean=1", ["learning_rates.mean", "did you mean 'means'?"]),
+    ("optimizer.eps=1", ["optimizer.eps"]),
+    ("raster.eps2d=1", ["raster.eps2d"]),
     ("schedule.min_views=20", ["max_views", "10", "20"]),
     ("optimizer.learning_rates.means=-1", ["means", "-1"]),
     ("train.iterations=0", ["iterations", "0"]),
-    ("train.iterations=many", ["train.iterations", "whole number", "many"]),
+    ("train.iterations=2147483648", ["iterations", "2147483648"]),
+    ("train.iterations=many", ["train.iterations", "whole number", "auto", "many"]),
     ("train.iterations=1.5", ["train.iterations", "whole number"]),
     ("train.iterations=true", ["train.iterations", "whole number"]),
     ("maps.beta=fast", ["maps.beta", "number"]),
@@ -98,6 +104,8 @@ BAD_OVERRIDES = [
     ("maps.beta=2", ["beta", "2"]),
     ("train.evaluate_at=0.5", ["train.evaluate_at", "list"]),
     ("train.evaluate_at=[0.5, 2]", ["evaluate_at", "2"]),
+    ("density.split=middle", ["density.split", "sample", "long_axis"]),
+    ("budget.time=1000000h", ["time", "at most 100h"]),
     ("train=5", ["section.key=value"]),
     ("train.iterations", ["section.key=value"]),
     ("train..seed=1", ["section.key=value"]),
@@ -133,11 +141,12 @@ def test_an_unknown_name_lists_the_known():
         ("", "one YAML document"),
         ("a: 1\n---\nb: 2", "one YAML document, found 2"),
         ("a: [1, 2", "not valid YAML"),
-        ("train: {seed: 1}\ntrain: {seed: 2}", "not valid YAML"),
+        ("train: {seed: 1}\ntrain: {seed: 2}", "not valid YAML.*twice"),
         ("a: " + "[" * (DEPTH_LIMIT + 1), "levels deep"),
         ("a: " + "x" * SIZE_LIMIT, "more than"),
         ("train: 5", "train: expected a mapping"),
         ("schedule: [1]", "schedule: expected a mapping"),
+        ("train: {seed: 2001-01-01}", "train.seed: expected a whole number, got '2001-01-01'"),
         ("base: mine.yaml", "mine"),
     ],
     ids=lambda text: text[:24],
@@ -145,6 +154,12 @@ def test_an_unknown_name_lists_the_known():
 def test_hostile_files_are_refused(write, text, message):
     with pytest.raises(InputError, match=message):
         load_config(write(text))
+
+
+@pytest.mark.parametrize("text", ["", "{", "[" * 200_000, "9" * 5000])
+def test_what_is_no_json_is_refused(text):
+    with pytest.raises(InputError, match=r"'a\.json' is not valid JSON"):
+        parse_json(text, "'a.json'")
 
 
 def test_a_base_is_looked_for_beside_its_file(write, tmp_path, monkeypatch):
@@ -166,6 +181,13 @@ def test_an_override_is_taken_whole(text):
     assert apply_overrides({}, [f"train.init={text}"]) == {"train": {"init": text.strip("'")}}
 
 
+@pytest.mark.parametrize("path", ["1e3", "0x10", "null", "2001-01-01", "a: b", "${oc.env:HOME}", "#1"])
+def test_a_text_is_read_back_as_it_was(path):
+    config = load_config("demo")
+    config.scene.path = path
+    assert resolve(parse_yaml(config.to_yaml(), "config")).scene.path == path
+
+
 def test_a_circle_of_bases_is_refused(write, tmp_path):
     file = write(f"base: {tmp_path / 'mine.yaml'}\n")
     with pytest.raises(InputError, match="circle"):
@@ -180,9 +202,14 @@ def test_missing_and_binary_files_are_refused(tmp_path):
         load_config(str(tmp_path / "binary.yaml"))
 
 
-def test_environment_variables_do_not_leak_into_a_config(monkeypatch):
-    monkeypatch.setenv("SECRET", "leaked")
-    assert load_config("turbogs", ["scene.path=${oc.env:SECRET}"]).scene.path == "${oc.env:SECRET}"
+def test_the_configuration_of_a_run_is_complete():
+    mapping = load_config("demo").without_plan().to_mapping()
+    assert resolve_complete(mapping, "config.yaml", decided=True).to_mapping() == mapping
+    del mapping["density"]["split"]
+    with pytest.raises(InputError, match=r"lacks settings of 'density'"):
+        resolve_complete(mapping, "config.yaml")
+    with pytest.raises(InputError, match=r"has auto for train\.backdrop"):
+        resolve_complete(load_config("turbogs").to_mapping(), "config.yaml", decided=True)
 
 
 def test_bands_open_on_their_schedule():
@@ -193,3 +220,56 @@ def test_bands_open_on_their_schedule():
 def test_the_start_and_the_end_are_always_evaluated():
     train = load_config("turbogs", ["train.iterations=10", "train.evaluate_at=[0.01, 0.5]"]).train
     assert train.evaluation_iterations() == {0, 1, 5, 10}
+
+
+@pytest.mark.parametrize(
+    ("text", "overrides"),
+    [
+        ("base: demo", ["train.iterations=2", "budget.time=9s"]),
+        ("base: demo\nbudget: {time: 9s}", ["train.iterations=2"]),
+        ("base: demo\ntrain: {iterations: 2}", ["budget.time=9s"]),
+    ],
+)
+def test_a_number_of_iterations_and_a_time_budget_exclude_each_other(write, text, overrides):
+    with pytest.raises(InputError, match=r"train.iterations=2 and the time budget 9s .* write train.iterations=auto"):
+        require_one_length(write(text), overrides)
+
+
+@pytest.mark.parametrize(
+    ("text", "overrides"),
+    [
+        ("base: demo", ["budget.time=9s"]),  # a packaged length
+        ("train: {iterations: 2}", ["budget.time=9s", "train.iterations=auto"]),
+        ("budget: {time: 9s}", ["train.iterations=2", "budget.time=''"]),
+        ("train: {iterations: 2}\nbudget: {time: 9s}", ["train.seed=1"]),  # as a run has written
+    ],
+)
+def test_one_of_the_two_is_taken(write, text, overrides):
+    load_config(write(text), overrides)
+    require_one_length(write(text), overrides)
+
+
+def test_amounts():
+    memory = {"2GiB": 2**31, "1.5 gib": 3 * 2**29, "1500MB": 1500 * 10**6, "4096": 4096, "7kib": 7168}
+    assert {text: parse_bytes(text) for text in memory} == memory
+    times = {"20s": 20, "2m": 120, "1.5 h": 5400, "0.5": 0.5, "3min": 180}
+    assert {text: parse_seconds(text) for text in times} == times
+
+
+@pytest.mark.parametrize("text", ["", "GiB", "-2GiB", "2 apples", "0", "1e9", "2GiB 3", "inf", "nan", "9" * 400])
+def test_no_amounts(text):
+    for parse in (parse_bytes, parse_seconds):
+        with pytest.raises(InputError, match="is no amount of"):
+            parse(text)
+
+
+@pytest.mark.parametrize("name", config_names())
+def test_every_setting_is_listed_with_its_meaning(name):
+    config = load_config(name)
+    lines = settings_text(config).splitlines()
+    assert [line for line, after in itertools.pairwise(lines) if " = " in line and not after.strip()] == []
+    for section, values in config.to_mapping().items():
+        assert {line.split(" = ")[0] for line in lines} >= {f"{section}.{key}" for key in values} - {
+            f"{section}.learning_rates"
+        }
+    assert len(all_settings()) <= 100

@@ -107,7 +107,7 @@ class Passes:
         monkeypatch.setattr(library, "launch", self.launch)
         monkeypatch.setattr(raster, "_check", lambda *arguments: None)  # it wants a GPU
         monkeypatch.setattr(torch.cuda, "Event", type("Event", (Arrived,), {"record": lambda event, stream: None}))
-        monkeypatch.setattr("turbogs_plugin.engine.cuda.workspace.current_stream", lambda device: None)
+        monkeypatch.setattr("torch.cuda.current_stream", lambda device: None)
 
     def launch(self, launch) -> None:
         tensors, *_ = launch.lists()

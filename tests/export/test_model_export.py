@@ -143,15 +143,6 @@ def test_bad_input_is_one_line(turbogs, finished, capture, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["points.ply"]
 
 
-def test_a_blur_that_no_file_holds_is_named(turbogs, finished, tmp_path):
-    shutil.copytree(finished, tmp_path / "run")
-    config = tmp_path / "run/config.yaml"
-    config.write_text(config.read_text().replace("eps2d: 0.3", "eps2d: 0.1"))
-    told = "(trained with raster.eps2d=0.1, which no file holds: most add 0.3)"
-    assert told in turbogs("export", tmp_path / "run", "--format", "pt")[1]
-    assert "eps2d" not in turbogs("export", finished, "--format", "pt", "--out", tmp_path / "a.pt")[1]
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [

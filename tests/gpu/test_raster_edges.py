@@ -8,7 +8,6 @@ import pytest
 import torch
 from helpers.raster_cases import GPU_ONLY, make_case, on_gpu, samples_to, upstream
 
-from turbogs_plugin.device import current_stream
 from turbogs_plugin.engine.cuda import library, workspace
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda.workspace import Workspace
@@ -123,7 +122,7 @@ def test_the_current_stream_is_torchs():
     for stream in (torch.cuda.default_stream(), *(torch.cuda.Stream() for _ in range(3))) * 2:
         with torch.cuda.stream(stream):
             for asked in (device, torch.device("cuda")):
-                assert current_stream(asked) == torch.cuda.current_stream() == stream
+                assert torch.cuda.current_stream(asked) == torch.cuda.current_stream() == stream
 
 
 def test_forward_is_deterministic(case):

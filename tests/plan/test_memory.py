@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from turbogs_plugin.config.configuration import load_config, resolve
-from turbogs_plugin.config.units import parse_bytes
+from turbogs_plugin.config.sections import parse_bytes
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, cap_of, growth_room, lowered_cap, with_cap, without_growth
 from turbogs_plugin.plan.memory import MemoryDemand, most_images

@@ -273,8 +273,9 @@ def test_the_bar_of_a_long_training_fits_a_terminal_of_80_columns(capsys, monkey
 
 
 @pytest.mark.parametrize("strips", [0, 1])
-def test_no_more_strips_than_asked_for(tmp_path, strips):
-    config = tiny_config(tiny_capture(tmp_path), "train.iterations=1", "scene.test_every=4", f"report.strips={strips}")
+def test_no_more_strips_than_the_bound(tmp_path, monkeypatch, strips):
+    monkeypatch.setattr("turbogs_plugin.report.pages.STRIPS", strips)
+    config = tiny_config(tiny_capture(tmp_path), "train.iterations=1", "scene.test_every=4")
     folder = run.train(config, tmp_path / "run", write_report).folder
     assert len(list((folder.path / "report").glob("test-*.jpg"))) == strips
     assert f"{strips} of 2 are shown" in folder.report.read_text()

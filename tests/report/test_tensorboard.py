@@ -105,9 +105,10 @@ def test_nothing_is_written_unless_asked_for(writers, capture, tmp_path):
 
 def test_strips_are_small_and_may_be_none(writers, capture, tmp_path, monkeypatch):
     monkeypatch.setattr("turbogs_plugin.report.tensorboard.WIDEST_STRIP", 60)
-    config = tiny_config(capture, *SHORT, ASKED, "report.strips=0")
-    run.train(config, tmp_path / "none", watch=event_writers(config))
     config = tiny_config(capture, *SHORT, ASKED)
+    with monkeypatch.context() as without:
+        without.setattr("turbogs_plugin.report.tensorboard.STRIPS", 0)
+        run.train(config, tmp_path / "none", watch=event_writers(config))
     run.train(config, tmp_path / "run", watch=event_writers(config))
     none, some = writers
     assert not none.images and none.scalars

@@ -19,7 +19,6 @@ from helpers.models import random_gaussians
 from PIL import Image
 
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.config.yaml_text import parse_yaml
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.gsplat_file import save_gsplat
 from turbogs_plugin.scene import Frame, load_scene
@@ -28,6 +27,7 @@ from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, 
 from turbogs_plugin.train.given_model import load_given
 from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.types import Gaussians
+from turbogs_plugin.yaml_json import parse_yaml
 
 MEMORY = 64 * 2**20
 """Python and numpy may allocate this much for files of less than a megabyte."""

@@ -24,9 +24,9 @@ def error_driven(**options) -> ErrorDrivenDensity:
 MAKERS = {
     "error_driven": error_driven,
     "no final": lambda: ErrorDrivenDensity(refine_from=5, refine_every=4, final_keep=1.0),
-    "fastgs": lambda: FastGsDensity(refine_from=5, refine_every=4, prune_every=9),
+    "fastgs": lambda: FastGsDensity(refine_from=5, refine_every=4),
     "mcmc": lambda: GsplatMcmcDensity(refine_start_iter=5, refine_every=4),
-    "gsplat_default": lambda: GsplatDefaultDensity(refine_start_iter=5, refine_every=4, reset_every=20),
+    "gsplat_default": lambda: GsplatDefaultDensity(refine_start_iter=5, refine_every=4),
     "none": NoDensity,
 }
 EXACT = ("error_driven", "no final", "fastgs", "mcmc", "none")

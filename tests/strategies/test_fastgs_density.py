@@ -1,12 +1,12 @@
-"""Multi-view-consistent density control: votes, events, and the GPU-only sibling's refusal."""
+"""Multi-view-consistent density control: votes and events."""
 
 import pytest
 import torch
 from helpers.bridge_host import make_splats
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.density import fastgs
 from turbogs_plugin.strategies.density.fastgs import FastGsDensity
-from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 from turbogs_plugin.types import Gaussians, Step
 
 COUNT = 8
@@ -45,34 +45,35 @@ OFTEN = [HIGH, LOW, LOW, LOW, LOW, LOW, LOW, LOW]
 ONCE = [HIGH, HIGH, LOW, LOW, LOW, LOW, LOW, LOW]
 
 
-def test_only_what_most_batches_mark_is_densified(gaussians):
-    """Gaussian 0 stands out in all four batches, Gaussian 1 in one: only 0 is split, though all gradients are high."""
-    density = FastGsDensity(refine_from=4, refine_every=4, consistency=0.5, prune_opacity=0.0, prune_world_size=0.0)
+def density_of(gaussians: Gaussians, **settings: int) -> FastGsDensity:
+    density = FastGsDensity(**settings)
     density.setup(gaussians)
+    return density
+
+
+@pytest.mark.parametrize(("consistency", "splits"), [(0.5, 1), (0.25, 2)])
+def test_only_what_most_batches_mark_is_densified(monkeypatch, gaussians, consistency, splits):
+    """Gaussian 0 stands out in all four batches, Gaussian 1 in one, though all gradients are high."""
+    monkeypatch.setattr(fastgs, "CONSISTENCY", consistency)
+    density = density_of(gaussians, refine_from=4, refine_every=4)
     *before, update = run_batches(density, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])
     assert before == [None, None, None]
-    assert update.num_split == 1 and update.num_cloned == update.num_pruned == 0
-    assert sorted(update.source.tolist()) == [0, 0, 1, 2, 3, 4, 5, 6, 7]
-    assert sorted(update.source[update.fresh].tolist()) == [0, 0]
-    assert len(density.stats.weight_sums) == 9 and not density.stats.weight_sums.any()
-    lenient = FastGsDensity(refine_from=4, refine_every=4, consistency=0.25, prune_opacity=0.0, prune_world_size=0.0)
-    lenient.setup(gaussians)
-    assert run_batches(lenient, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])[-1].num_split == 2
+    assert update.num_split == splits and update.num_cloned == update.num_pruned == 0
+    assert sorted(update.source[update.fresh].tolist()) == sorted(2 * [*range(splits)])
+    assert len(density.stats.weight_sums) == 8 + splits and not density.stats.weight_sums.any()
 
 
 @pytest.mark.parametrize(("error_threshold", "splits"), [(2.9, 2), (3.1, 0)])
-def test_a_mark_is_an_error_of_so_many_means(gaussians, error_threshold, splits):
+def test_a_mark_is_an_error_of_so_many_means(monkeypatch, gaussians, error_threshold, splits):
     """The two Gaussians of `ONCE` that stand out have three times the mean error."""
-    always = {"prune_opacity": 0.0, "prune_world_size": 0.0, "error_threshold": error_threshold}
-    density = FastGsDensity(refine_from=2, refine_every=2, **always)
-    density.setup(gaussians)
+    monkeypatch.setattr(fastgs, "ERROR_THRESHOLD", error_threshold)
+    density = density_of(gaussians, refine_from=2, refine_every=2)
     update = run_batches(density, gaussians, [ONCE, ONCE])[-1]
     assert (0 if update is None else update.num_split) == splits
 
 
 def test_batches_that_did_not_see_it_do_not_count(gaussians):
-    density = FastGsDensity(refine_from=4, refine_every=4, prune_opacity=0.0, prune_world_size=0.0)
-    density.setup(gaussians)
+    density = density_of(gaussians, refine_from=4, refine_every=4)
     unseen = [0.0] + [1.0] * (COUNT - 1)
     for iteration in range(1, 5):
         add_batch(density, OFTEN, None if iteration == 1 else unseen)
@@ -81,80 +82,49 @@ def test_batches_that_did_not_see_it_do_not_count(gaussians):
 
 
 def test_a_low_gradient_is_not_densified(gaussians):
-    density = FastGsDensity(refine_from=1, refine_every=1, prune_opacity=0.0, prune_world_size=0.0)
-    density.setup(gaussians)
+    density = density_of(gaussians, refine_from=1, refine_every=1)
     add_batch(density, OFTEN, gradient=1e-6)
     assert density.update(gaussians, Step(1, 1000, 500)) is None
 
 
-def test_after_densification_the_most_blamed_go(gaussians):
-    density = FastGsDensity(prune_every=3, prune_opacity=0.0, blame_threshold=0.9)
-    density.setup(gaussians)
-    updates = run_batches(density, gaussians, [OFTEN, ONCE, OFTEN], first=501)
-    assert updates[:2] == [None, None]
-    assert updates[2].source.tolist() == list(range(1, COUNT))
-    assert updates[2].num_pruned == 1 and not updates[2].fresh.any()
-
-
-def test_blame_counts_by_the_error_of_its_batch(gaussians):
-    """Gaussian 0 stands out in a batch of large errors, Gaussian 1 in one of small errors."""
-    density = FastGsDensity(prune_every=2, prune_opacity=0.0, blame_threshold=0.9)
-    density.setup(gaussians)
-    small = [0.01, 0.09, *[0.01] * (COUNT - 2)]
-    update = run_batches(density, gaussians, [OFTEN, small], first=501)[-1]
-    assert update.source.tolist() == list(range(1, COUNT))
+@pytest.mark.parametrize("second", [OFTEN, [0.01, 0.09, *[0.01] * (COUNT - 2)]])
+def test_after_densification_the_most_blamed_go(gaussians, second):
+    """Blame counts by the error of its batch: Gaussian 1 stands out in batches of small errors alone."""
+    density = density_of(gaussians, refine_every=1)
+    updates = run_batches(density, gaussians, [OFTEN, *[second] * 5], first=501)
+    assert updates[:5] == [None] * 5
+    assert updates[5].source.tolist() == list(range(1, COUNT))
+    assert updates[5].num_pruned == 1 and not updates[5].fresh.any()
 
 
 def test_an_event_that_changes_nothing_begins_a_new_window_too(gaussians):
-    density = FastGsDensity(refine_from=2, refine_every=2, prune_opacity=0.0, prune_world_size=0.0)
-    density.setup(gaussians)
+    density = density_of(gaussians, refine_from=2, refine_every=2)
     assert run_batches(density, gaussians, [[LOW] * COUNT] * 2) == [None, None]
     assert not any(value.any() for part in density.state_dict().values() for value in part.values())
 
 
 def test_a_resumed_window_goes_on_exactly(gaussians):
-    straight, first, second = (FastGsDensity(refine_from=4, refine_every=4, prune_world_size=0.0) for _ in range(3))
-    for density in (straight, first, second):
-        density.setup(gaussians)
+    straight, first, second = (density_of(gaussians, refine_from=4, refine_every=4) for _ in range(3))
     expected = run_batches(straight, gaussians, [OFTEN, ONCE, OFTEN, OFTEN])[-1]
     run_batches(first, gaussians, [OFTEN, ONCE])
     second.load_state_dict(first.state_dict())
     actual = run_batches(second, gaussians, [OFTEN, OFTEN], first=3)[-1]
     assert torch.equal(actual.source, expected.source)
     assert torch.equal(actual.values["means"], expected.values["means"])
-    other = FastGsDensity()
-    other.setup(gaussians.map(lambda value: value[:3]))
+    other = density_of(gaussians.map(lambda value: value[:3]))
     with pytest.raises(InputError, match=r"has shape \(8,\), expected \(3,\)"):
         other.load_state_dict(first.state_dict())
 
 
-def test_statistics_end_with_the_last_event(gaussians):
-    density = FastGsDensity(prune_every=300)
-    density.setup(gaussians)
+def test_statistics_end_with_the_last_event_and_begin_again_in_a_run_that_becomes_longer(gaussians):
+    """A time budget makes a run longer that finds iterations cheaper than it thought."""
+    density = density_of(gaussians, refine_every=50)
     assert density.update(gaussians, Step(801, 1000, 500)) is None
     assert density.stats is None
     assert density.update(gaussians, Step(802, 1000, 500)) is None
     assert density.stats is None
-
-
-def test_statistics_begin_again_in_a_run_that_becomes_longer(gaussians):
-    """As a time budget makes it, that finds iterations cheaper than it thought."""
-    density = FastGsDensity(prune_every=300, prune_opacity=0.0)
-    density.setup(gaussians)
-    assert density.update(gaussians, Step(801, 1000, 500)) is None
-    assert density.update(gaussians, Step(802, 1200, 500)) is None
-    add_batch(density, ONCE)
     assert density.update(gaussians, Step(803, 1200, 500)) is None
+    add_batch(density, ONCE)
+    assert density.update(gaussians, Step(804, 1200, 500)) is None
     update = density.update(gaussians, Step(1100, 1200, 500))
     assert update.num_pruned == 2 and update.source.tolist() == list(range(2, COUNT))
-
-
-@pytest.mark.parametrize(("field", "value"), [("consistency", 0.0), ("error_threshold", -1.0), ("prune_every", 0)])
-def test_invalid_fields_are_refused(field, value):
-    with pytest.raises(InputError, match=field):
-        FastGsDensity(**{field: value})
-
-
-def test_mcmc_says_that_it_needs_a_gpu(gaussians):
-    with pytest.raises(InputError, match="'mcmc' needs a GPU"):
-        GsplatMcmcDensity().setup(gaussians)

@@ -36,7 +36,7 @@ def test_both_ends(schedule):
     [
         (SinusoidalSchedule(), math.sin(math.pi / 2 * math.sqrt(0.25))),
         (LinearSchedule(), 0.25),
-        (ExponentialSchedule(steepness=3.0), (1 - math.exp(-0.75)) / (1 - math.exp(-3))),
+        (ExponentialSchedule(), (1 - math.exp(-0.75)) / (1 - math.exp(-3))),
     ],
 )
 def test_between(schedule, phi):
@@ -98,7 +98,6 @@ def test_fixed(views, num_views, expected):
         (LinearSchedule, {"pixel_budget": -1.0}, "pixel_budget"),
         (LinearSchedule, {"pixel_budget": math.nan}, "pixel_budget"),
         (LinearSchedule, {"alpha": -1.0}, "alpha"),
-        (ExponentialSchedule, {"steepness": 0.0}, "steepness"),
         (ExponentialSchedule, {"max_views": 1}, "max_views"),
         (FixedSchedule, {"views": 0}, "views"),
         (FixedSchedule, {"pixel_budget": 0.0}, "pixel_budget"),

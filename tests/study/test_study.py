@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.config.scaling import with_iterations
-from turbogs_plugin.config.yaml_text import packaged_names
+from turbogs_plugin.config.sections import WRITTEN_FOR
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.grid import PACKAGE, Ablation, load_ablation, variant_config
 from turbogs_plugin.study.results import CellResult, Study, curve_and_final
@@ -19,6 +19,7 @@ from turbogs_plugin.study.statistics import Difference, Spread, mean_curve, pare
 from turbogs_plugin.study.study_plots import draw_over_size, draw_over_time, shown_rows
 from turbogs_plugin.study.study_report import report_text
 from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.yaml_json import packaged_names
 
 
 def entry(iteration: int, seconds: float, psnr: float, count: int = 100) -> Evaluation:
@@ -101,8 +102,8 @@ def test_another_length_scales_what_counts_iterations_and_nothing_else():
     assert changed == {"refine_from", "refine_every", "final_every", "opacity_decay"}
     assert (short.density["refine_from"], short.density["refine_every"], short.density["final_every"]) == (20, 10, 50)
     assert with_iterations(config, 50).density["refine_every"] == 10
-    same = with_iterations(config, config.train.base_iterations)
-    assert same.train.iterations == config.train.base_iterations, "a length asked for is not the plan's to change"
+    same = with_iterations(config, WRITTEN_FOR)
+    assert same.train.iterations == WRITTEN_FOR, "a length asked for is not the plan's to change"
     same.train.iterations = config.train.iterations
     assert same.to_yaml() == before
 

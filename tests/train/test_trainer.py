@@ -22,7 +22,6 @@ from helpers.processes import PRELOADED, ended
 from PIL import Image
 
 from turbogs_plugin.config.configuration import Config, load_config, resolve
-from turbogs_plugin.config.yaml_text import parse_yaml
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import spatial_order
@@ -38,6 +37,7 @@ from turbogs_plugin.train.metrics import render_view
 from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import LossOutput, PixelSamples, RowUpdate
+from turbogs_plugin.yaml_json import parse_yaml
 
 pytestmark = pytest.mark.usefixtures("plotted")
 
@@ -414,11 +414,11 @@ def test_what_stands_before_a_camera_goes_with_the_next_change(capture, clears, 
 
 
 def test_the_trainer_names_no_strategy():
-    from turbogs_plugin.config import registry
+    from turbogs_plugin.strategies import TYPES
     from turbogs_plugin.train import trainer
 
     source = Path(trainer.__file__).read_text()
-    classes = [name for kind in registry.BUILT_IN.values() for name in kind.values()]
+    classes = [place.partition(":")[2] for kind in TYPES.values() for place in kind.values()]
     assert not [name for name in classes if name in source]
 
 

@@ -121,7 +121,7 @@ NO_SCENE = GivenOptions()
 
 def budget_overrides(max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
     """The options of a budget as overrides."""
-    from turbogs_plugin.config.units import parse_bytes, parse_seconds
+    from turbogs_plugin.config.sections import parse_bytes, parse_seconds
 
     for option, amount in (("--max-memory", max_memory), ("--time-budget", time_budget)):
         if amount == "":

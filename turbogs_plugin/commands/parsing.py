@@ -11,8 +11,7 @@ from contextlib import redirect_stderr
 
 from tyro.extras import subcommand_cli_from_dict
 
-from turbogs_plugin.config.schema import nearest
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.errors import InputError, nearest
 
 EDGE = re.compile(r"^[│|] ?|[ │|]+$")
 RULE = re.compile(r"[ ─-]{8,}$")

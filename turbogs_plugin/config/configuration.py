@@ -1,10 +1,9 @@
 """The configuration of a run: dataclasses <- YAML <- dotted overrides.
 
-A YAML has one section a part. Sections of our own (`scene`, `train`, `maps`, `raster`, `report`, `budget`) hold the
-fields of a dataclass of `turbogs_plugin.config.sections`; a section of a strategy holds its ``type`` and the fields of
-that strategy's dataclass. Defaults live in those dataclasses and nowhere else. ``base: NAME_OR_FILE`` puts a YAML on
-top of another; a file is looked for beside it. Some settings may be ``auto`` (`turbogs_plugin.config.auto`): the plan
-of a run decides them.
+A YAML has one section a part. The sections `scene`, `train`, `maps`, `raster`, `report` and `budget` hold the settings
+of a dataclass (`SECTION_CLASSES`); a strategy's section holds its ``type`` and the settings of that strategy's own
+dataclass. Defaults live in those dataclasses and nowhere else. ``base: NAME_OR_FILE`` puts a YAML on top of another; a
+file is looked for beside it. The plan of a run decides settings that are ``auto`` (`sections.AUTO_SETTINGS`).
 """
 
 from __future__ import annotations
@@ -15,16 +14,22 @@ from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from omegaconf import OmegaConf
-
-from turbogs_plugin.config import registry
-from turbogs_plugin.config.auto import AUTO, AUTO_SETTINGS, undecided
-from turbogs_plugin.config.old_spellings import old_spelling
-from turbogs_plugin.config.schema import build_dataclass, dataclass_mapping, nearest
-from turbogs_plugin.config.sections import BudgetConfig, MapsConfig, ReportConfig, SceneConfig, TrainConfig
-from turbogs_plugin.config.yaml_text import packaged_names, parse_yaml, read_named_yaml
+from turbogs_plugin.config.components import KINDS, build, default_type
+from turbogs_plugin.config.sections import (
+    AUTO,
+    AUTO_SETTINGS,
+    WRITTEN_FOR,
+    BudgetConfig,
+    MapsConfig,
+    ReportConfig,
+    SceneConfig,
+    TrainConfig,
+    undecided,
+)
+from turbogs_plugin.config.typed import build_dataclass, dataclass_mapping
 from turbogs_plugin.engine.rendered import RasterSettings
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.errors import InputError, nearest
+from turbogs_plugin.yaml_json import packaged_names, parse_yaml, read_named_yaml, yaml_text
 
 PACKAGE = "turbogs_plugin.configs"
 """Where the packaged configurations are."""
@@ -33,15 +38,12 @@ DEFAULT_CONFIG = "turbogs"
 """The packaged configuration that a run without ``--config`` takes."""
 
 BASE_DEPTH_LIMIT = 8
-"""Configurations under one another by ``base``."""
+"""Most configurations under one another by ``base``."""
 
 
 @dataclass
 class Config:
-    """Everything that decides a run. The strategies' sections are complete: `type` and every init field.
-
-    Settings that are ``auto`` are decided by the plan of a run (`turbogs_plugin.plan.Plan.apply`).
-    """
+    """Everything that decides a run. A strategy's section is complete: its `type` and every setting."""
 
     scene: SceneConfig
     train: TrainConfig
@@ -58,10 +60,10 @@ class Config:
 
     def build(self, kind: str) -> Any:
         """A new strategy of this kind."""
-        return registry.build(kind, getattr(self, kind))
+        return build(kind, getattr(self, kind))
 
     def require_decided(self) -> None:
-        """RuntimeError, for it is an error of ours, where a setting is left to a plan: no run can go by that."""
+        """Raise RuntimeError, an error of the caller's code, where a setting is left to a plan: no run can use it."""
         left = undecided(self.to_mapping())
         if left:
             raise RuntimeError(
@@ -70,12 +72,12 @@ class Config:
             )
 
     def without_plan(self) -> Config:
-        """This configuration, decided for a run that looks at neither scene nor machine, as those of benchmarks do."""
+        """This configuration, decided for a run that looks at neither scene nor machine, such as a benchmark."""
         mapping = self.to_mapping()
         for setting in undecided(mapping):
             section, key = setting.split(".")
             value = AUTO_SETTINGS[setting]
-            mapping[section][key] = self.train.base_iterations if value is None else value
+            mapping[section][key] = WRITTEN_FOR if value is None else value
         return resolve(mapping)
 
     def changed(self, **sections: Mapping[str, Any]) -> Config:
@@ -86,16 +88,18 @@ class Config:
         return resolve(mapping)
 
     def to_mapping(self) -> dict[str, Any]:
-        """Plain YAML values, every field written out, in sections that may be changed."""
+        """Plain YAML values, every setting written out, in sections that the caller may change."""
         return dataclass_mapping(self)
 
     def to_yaml(self) -> str:
-        """Every setting; read back, it gives this very configuration."""
-        return OmegaConf.to_yaml(OmegaConf.create(self.to_mapping()))
+        """Every setting as YAML; read back, it gives an equal configuration."""
+        return yaml_text(self.to_mapping())
 
 
-SECTION_CLASSES = {name: hint for name, hint in get_type_hints(Config).items() if is_dataclass(hint)}
-"""The sections that are no strategy's."""
+SECTION_CLASSES: dict[str, type] = {
+    name: hint for name, hint in get_type_hints(Config).items() if isinstance(hint, type) and is_dataclass(hint)
+}
+"""Section that is no strategy's -> its dataclass."""
 
 
 def config_names() -> list[str]:
@@ -115,45 +119,37 @@ def load_config(name_or_file: str = DEFAULT_CONFIG, overrides: Sequence[str] = (
 
 def require_one_length(name_or_file: str, overrides: Sequence[str]) -> None:
     """Raise `InputError` where overrides ask for a time budget and a number of iterations, or for one of them beside a
-    file of the user's that has the other. A number of a packaged configuration is no request.
+    file of the user's that has the other.
 
-    A file that has both is no contradiction: the configuration of a run with a time budget is such a one.
+    A number in a packaged configuration is no request. A file that has both is no contradiction either: a run with a
+    time budget writes both into its configuration.
 
     Args:
-        name_or_file, overrides: which `load_config` takes.
+        name_or_file, overrides: the arguments of `load_config`.
     """
-    told, filed = apply_overrides({}, overrides), _load_mapping(name_or_file, packaged=False)
-
-    def said(mapping: Mapping[str, Any], section: str, key: str) -> Any:
-        return mapping.get(section, {}).get(key)
-
-    asked = _merge(filed, told)
-    iterations, seconds = said(asked, "train", "iterations"), said(asked, "budget", "time")
-    by_override = said(told, "train", "iterations") is not None or said(told, "budget", "time") is not None
+    told = apply_overrides({}, overrides)
+    asked = _merge(_load_mapping(name_or_file, packaged=False), told)
+    iterations, seconds = asked.get("train", {}).get("iterations"), asked.get("budget", {}).get("time")
+    by_override = "iterations" in told.get("train", {}) or "time" in told.get("budget", {})
     if by_override and seconds and iterations not in (None, AUTO):
-        of, remedy = "", "leave one out"
-        if said(told, "train", "iterations") is None:
-            of, remedy = f" of '{name_or_file}'", f"add train.iterations={AUTO}, or leave the budget out"
         raise InputError(
-            f"train.iterations={iterations}{of} and the time budget {seconds} exclude each other: {remedy}"
+            f"train.iterations={iterations} and the time budget {seconds} exclude each other: leave one out, or "
+            f"write train.iterations={AUTO}"
         )
 
 
 def resolve(mapping: Mapping[str, Any]) -> Config:
     """The complete, checked configuration of a mapping of sections; absent sections have their defaults."""
-    old = old_spelling(mapping)
-    if old:
-        raise InputError(old)
     for section in mapping:
-        if section not in SECTION_CLASSES and section not in registry.KINDS:
-            raise InputError(f"unknown section '{section}': {nearest(section, [*SECTION_CLASSES, *registry.KINDS])}")
+        if section not in SECTION_CLASSES and section not in KINDS:
+            raise InputError(f"unknown section '{section}': {nearest(section, [*SECTION_CLASSES, *KINDS])}")
     sections: dict[str, Any] = {
         name: build_dataclass(cls, mapping.get(name, {}), name) for name, cls in SECTION_CLASSES.items()
     }
-    for kind in registry.KINDS:
+    for kind in KINDS:
         section = mapping.get(kind, {})
-        strategy = registry.build(kind, section)
-        sections[kind] = {"type": section.get("type", registry.default_type(kind)), **dataclass_mapping(strategy)}
+        strategy = build(kind, section)
+        sections[kind] = {"type": section.get("type", default_type(kind)), **dataclass_mapping(strategy)}
     return Config(**sections)
 
 
@@ -165,35 +161,19 @@ def resolve_complete(mapping: Mapping[str, Any], where: str, decided: bool = Fal
         decided: whether nothing may be left to a plan.
 
     Raises:
-        InputError: a part of it is missing or, where that is asked for, left to a plan; or an earlier version wrote it.
+        InputError: a part of it is missing or, where that is asked for, left to a plan.
     """
-    old = old_spelling(mapping)
-    if old:
-        raise InputError(f"'{where}' is of an earlier version, whose runs are not read: {old}; train anew")
     try:
         config = resolve(mapping)
-    except registry.MissingStrategyError as error:
-        raise InputError(f"'{where}': {error}") from None
     except InputError as error:
         raise InputError(f"'{where}': {error}; bring back what was written there") from None
-    missing = _first_missing(config.to_mapping(), mapping)
+    missing = [name for name, section in config.to_mapping().items() if mapping.get(name) != section]
     if missing:
-        raise InputError(f"'{where}' lacks '{missing}', which this version writes: bring the file back, or train anew")
+        raise InputError(f"'{where}' lacks settings of '{missing[0]}' that a run writes: bring it back, or train anew")
     left = undecided(mapping) if decided else []
     if left:
         raise InputError(f"'{where}' has {AUTO} for {', '.join(left)}, which a run decides: bring the file back")
     return config
-
-
-def _first_missing(complete: Mapping[str, Any], given: Mapping[str, Any]) -> str:
-    """Dotted place of the first key that is not given; empty where all are."""
-    for key, value in complete.items():
-        if key not in given:
-            return key
-        below = _first_missing(value, given[key]) if isinstance(value, Mapping) else ""
-        if below:
-            return f"{key}.{below}"
-    return ""
 
 
 def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -203,7 +183,7 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         path, separator, text = override.partition("=")
         keys = path.strip().split(".")
         if not separator or len(keys) < 2 or not all(keys):
-            hint = f", as {keys[0]}.type={text} is" if separator and keys[0] in registry.KINDS else ""
+            hint = f", as {keys[0]}.type={text} is" if separator and keys[0] in KINDS else ""
             raise InputError(f"override '{override}' is not of the form section.key=value{hint}")
         if not text.strip():
             raise InputError(f"override '{override}' lacks a value: write one behind the =, or null for none")
@@ -212,7 +192,7 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         parsed = {"value": text} if plain else parse_yaml(f"value: {text}", f"override '{override}'")
         if set(parsed) != {"value"}:
             raise InputError(f"override '{override}' has more than one value")
-        nested = parsed["value"]
+        nested: Any = parsed["value"]
         for key in reversed(keys):
             nested = {key: nested}
         result = _merge(result, nested)
@@ -233,7 +213,7 @@ def _load_mapping(name_or_file: str, depth: int = 0, packaged: bool = True) -> d
 
 
 def named_beside(name: str, file: str) -> str:
-    """What a name in a YAML file means: a packaged configuration, or a file by its place beside that one."""
+    """The meaning of a name in a YAML file: a packaged configuration, or a file by its place beside `file`."""
     path = Path(file).parent / name
     is_file = path.suffix in (".yaml", ".yml") or path.is_file()
     return str(path) if is_file and name not in config_names() else name
@@ -252,7 +232,7 @@ def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _changes_type(kind: str, below: Mapping[str, Any], value: Mapping[str, Any]) -> bool:
-    if kind not in registry.KINDS or "type" not in value:
+    if kind not in KINDS or "type" not in value:
         return False
-    default = registry.default_type(kind)
+    default = default_type(kind)
     return value["type"] != below.get("type", default)

@@ -1,5 +1,5 @@
-"""Scaling of schedules: in a run of another length, what counts iterations goes along; for more processes, what makes
-the batch of an iteration, and the learning rates."""
+"""Scaling of settings: those that count iterations, to a run of another length; those that make the batch of an
+iteration, and the learning rates, to more processes."""
 
 from __future__ import annotations
 
@@ -8,23 +8,17 @@ from turbogs_plugin.errors import InputError
 
 ITERATION_FIELDS = {
     "train": ("refine_until", "sh_interval"),
-    "density": (
-        "refine_from",
-        "refine_every",
-        "final_every",
-        "prune_every",
-        "refine_start_iter",
-        "refine_scale2d_stop_iter",
-    ),
+    "density": ("refine_from", "refine_every", "final_every", "refine_start_iter"),
 }
-"""Settings that count iterations: a run of another length scales them. Not gsplat's `reset_every`: what a reset of
-opacities takes away grows back at the rate of the optimizer, however short the run."""
+"""Settings that count iterations: a run of another length scales them. gsplat's interval of resets is not among them:
+what a reset of opacities takes away grows back at the rate of the optimizer, however short the run."""
 
 SHORTEST_INTERVAL = 10
-"""Scaling makes no interval of density control shorter: its statistics need a window of some iterations."""
+"""Shortest interval of density control that scaling makes: its statistics need a window of some iterations."""
 
 REGROWTH = 50
-"""Iterations in which opacities grow back what an event of density control takes; one that comes sooner takes less."""
+"""Iterations in which opacities grow back what an event of density control takes; an event that comes sooner takes
+less."""
 
 
 def with_iterations(config: Config, iterations: int) -> Config:
@@ -46,7 +40,7 @@ def with_iterations(config: Config, iterations: int) -> Config:
             if value:
                 least = min(value, SHORTEST_INTERVAL) if section == "density" else 1
                 mapping[section][name] = max(least, round(value * factor))
-    mapping["train"]["iterations"] = mapping["train"]["base_iterations"] = iterations
+    mapping["train"]["iterations"] = iterations
     if density.get("opacity_decay", 0.0):
         density["opacity_decay"] = decay_at(density["opacity_decay"], interval, density.get("refine_every", REGROWTH))
     return resolve(mapping)
@@ -56,25 +50,28 @@ BATCH_FIELDS = ("min_views", "max_views", "views", "pixel_budget")
 """Settings of a schedule that grow with the batch."""
 
 RATE_EXPONENT = 0.5
-"""Learning rates grow with this power of the batch: with a gradient that is mostly noise, Adam's step has the length of
-its rate whatever the batch, and so many small steps end as far apart as one of their number's root (Malladi et al.
-2022; Grendel, Zhao et al. 2024, found it for Gaussians)."""
+"""Learning rates grow with this power of the batch. Where a gradient is mostly noise, Adam's step has the length of its
+rate whatever the batch, and n small steps go as far as one that is sqrt(n) times as long (Malladi et al. 2022; for
+Gaussians: Grendel, Zhao et al. 2024)."""
 
 MOMENT_FIELDS = ("beta1", "beta2")
-"""Decays of an optimizer's moments, which are raised to the power of the batch: so moments forget after as many samples
-as before, not after as many iterations (Grendel). Measured: `configs/ablations/batch.yaml`."""
+"""Decays of an optimizer's moments, raised to the power of the batch: moments then forget after a number of samples,
+not of iterations (Grendel). Measured by `configs/ablations/batch.yaml`."""
 
 
 def with_batch_for(config: Config, processes: int) -> Config:
-    """The configuration whose batch is written for one process, with that of several: so many times the views and
-    pixels of an iteration, learning rates times its root, and moments that forget after as many samples."""
+    """The configuration for `processes` that train together, from one whose batch is written for one process.
+
+    Views and pixels of an iteration are multiplied by the number of processes, learning rates by its root; moments
+    forget after an unchanged number of samples.
+    """
     mapping = config.to_mapping()
     schedule, optimizer = mapping["schedule"], mapping["optimizer"]
     for name in set(BATCH_FIELDS) & set(schedule):
         schedule[name] *= processes
     for name in set(MOMENT_FIELDS) & set(optimizer):
         optimizer[name] **= processes
-    for section in (optimizer, mapping["density"]):  # of some density control, too: its noise goes by them
+    for section in (optimizer, mapping["density"]):  # 3DGS-MCMC's noise goes by learning rates, too
         rates = section.get("learning_rates")
         if isinstance(rates, dict) and "batch_scale" in rates:
             rates["batch_scale"] *= processes**RATE_EXPONENT

@@ -1,19 +1,46 @@
-"""The sections of a configuration that are no strategy's: what they hold, their defaults, and what is refused."""
+"""The sections of a configuration that are no strategy's: what they hold, their defaults, and what is refused; amounts
+of memory and time, and colours, as people write them; and the settings that may be ``auto``."""
 
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-from turbogs_plugin.config.units import parse_bytes, parse_color, parse_seconds
-from turbogs_plugin.errors import require, require_not_negative
+from PIL import ImageColor
+
+from turbogs_plugin.errors import InputError, require, require_not_negative
+from turbogs_plugin.types import Color
+
+AUTO = "auto"
+"""A value that leaves the setting to the plan of a run, which looks at scene and machine (`turbogs_plugin.plan`)."""
 
 LONGEST_TIME = 100 * 3600.0
-"""Seconds of a time budget: the iterations that fit can be counted (less than 2^31) even where one takes 0.2 ms."""
+"""Most seconds of a time budget: iterations of 0.2 ms that fit are still fewer than 2^31."""
 
 Auto = Literal["auto"]
-"""A value that leaves the setting to the plan of a run, which looks at scene and machine (`turbogs_plugin.plan`)."""
+"""The type of `AUTO`."""
+
+AUTO_SETTINGS: dict[str, Any] = {
+    "train.backdrop": False,
+    "train.background": "black",
+    "train.exposure": False,
+    "train.dropout": 0.0,
+    "train.batch_for": 1,
+    "train.iterations": None,
+    "train.maps_place": "device",
+    "train.photos_place": "device",
+}
+"""Setting that may be ``auto`` -> its value if no plan is made; None: `WRITTEN_FOR`. What a plan makes of ``auto`` is
+decided in `turbogs_plugin.plan.decisions`. `train.device` is not among them, as a plan is made for a given device."""
+
+STRIPS = 8
+"""Test views that a report, and TensorBoard, show as pictures, at most."""
+
+WRITTEN_FOR = 5000
+"""Iterations for which the settings that count iterations are written where `train.iterations` is ``auto``."""
 
 Place = Literal["auto", "device", "host"]
 """Where large tensors are: on the device, or in pinned memory of the host, from where a window of them travels."""
@@ -24,9 +51,9 @@ class SceneConfig:
     """Which photos.
 
     Args:
-        path: the capture's folder; the command line sets it.
-        factor: photos are scaled down by this.
-        test_every: every n-th image in name order tests.
+        path: folder of the capture; the command line sets it.
+        factor: divisor of the photos' width and height.
+        test_every: every n-th photo in name order tests.
     """
 
     path: str = ""
@@ -43,40 +70,41 @@ class TrainConfig:
     """The run itself.
 
     Args:
-        iterations: T. A number leaves all other settings as they are. ``auto``: as many as `epochs` take, 30,000 at
-            most, and all settings that count iterations (`turbogs_plugin.config.scaling`) are scaled from
-            `base_iterations`.
+        iterations: length of the run, T in the paper. A number leaves all other settings as they are. ``auto``: as many
+            as `epochs` take, 30,000 at most, and all settings that count iterations (`turbogs_plugin.config.scaling`)
+            are scaled from `WRITTEN_FOR`.
         epochs: passes over the training photos: iterations times images per iteration, divided by training views. Used
             where `iterations` is ``auto``, and where a time budget allows for more.
-        base_iterations: the length for which the settings that count iterations are written. Used where `iterations`
-            is ``auto``.
-        batch_for: number of processes that the settings of a batch are written for: views and pixels of an iteration,
-            learning rates and the decays of moments. ``auto``: they are written for one, and scaled to those that train
-            together (`turbogs_plugin.config.scaling.with_batch_for`).
-        refine_until: tau_until, the last iteration of densification, which also ends the annealing of the sampling.
-        seed: of all randomness.
-        device: auto (CUDA where there is one), cpu, or cuda.
-        maps_place, photos_place: where error and age maps, and where the photos are. It changes no result.
+        batch_for: number of processes for which the settings of a batch are written: views and pixels of an iteration,
+            learning rates and the decays of moments. ``auto``: they are written for one, and scaled to the processes
+            that train together (`turbogs_plugin.config.scaling.with_batch_for`).
+        refine_until: last iteration of densification, tau_until in the paper, which also ends the annealing of the
+            sampling.
+        seed: seed of all random numbers.
+        device: ``cpu``, ``cuda``, or ``auto``: CUDA where there is a GPU.
+        maps_place: where error and age maps are (`Place`). Changes no result.
+        photos_place: where photos are (`Place`). Changes no result.
         init: what training starts from: ``points`` of the capture; ``random`` points, in a cube about what the cameras
             look at; or a model's file, a .ply, gsplat's .pt, a checkpoint or a run's folder. A model is taken as it is:
             all its bands are in use from the start, and `initial_opacity` and `initial_size` change nothing.
         init_world: coordinates of a model's file: ``capture``, the capture's own, or ``gsplat``, the normalised world
             of gsplat's example trainer. Also for a model that eval, render, export or view is given with a capture.
-        sh_degree: highest degree of the spherical harmonics.
-        sh_interval: iterations between two bands; the run starts with band 0, but for a model's file.
         refine_cameras: train with cameras that agree better with the points that photos show: each photo has a pose,
             focal lengths and a principal point of its own (`turbogs_plugin.scene.camera_refinement`). Nothing where the
             capture does not say which photos show a point, as COLMAP does. Test photos keep their cameras.
-        initial_opacity, initial_size: of the Gaussians that training starts with; the size in mean distances to the
-            three nearest points. 3DGS has 0.1 and 1, gsplat's MCMC preset 0.5 and 0.1.
+        sh_degree: highest degree of the spherical harmonics.
+        sh_interval: iterations between two bands; a run starts with band 0, unless from a model's file.
+        initial_opacity: opacity of the Gaussians that training starts with, 0.1 in 3DGS, 0.5 in gsplat's MCMC preset.
+        initial_size: standard deviation of the Gaussians that training starts with, in mean distances to the three
+            nearest points, 1 in 3DGS, 0.1 in gsplat's MCMC preset.
         background: colour that shows through the model: ``black``, ``white``, another that Pillow knows, as
             ``rgb(51, 102, 153)``; or ``random``, another one each iteration, so that nothing dark is taken for empty.
             ``auto``: random where photos are transparent, else black. Transparent photos are composited on it.
         backdrop: start with a far sphere of Gaussians in the photos' mean colour behind the scene.
         exposure: learn an affine colour for each training photo, for captures whose exposure or white balance changes
-            from photo to photo (`turbogs_plugin.engine.exposures`). Test photos are compared with that of the training
-            photos before and after them (`turbogs_plugin.train.look`). ``auto``: where photos differ,
-            but little from those before and after them.
+            from photo to photo (`turbogs_plugin.engine.exposures`). Test photos are compared with the exposure of the
+            training photos before and after them (`turbogs_plugin.train.look`). ``auto``: where
+            photos differ, but little from those before and after them.
         dropout: share of the Gaussians that each iteration leaves out, drawn anew each time, until
             `trainer.DROPOUT_UNTIL` of the run. ``auto``: where points are a median of 0.4 pixels or more from
             where photos show them.
@@ -85,14 +113,13 @@ class TrainConfig:
         camera_clearance: a change of the set of Gaussians also removes those that stand nearer to a training camera
             than the capture's points do (`turbogs_plugin.model.limits`). Nothing where it has no points of its own.
         average_last: share of the iterations, at the end of the run and since the last change of the set of Gaussians,
-            whose mean the model becomes (`turbogs_plugin.train.parameter_mean`). 0: it stays that of the last one.
-        evaluate_at: when to evaluate, as fractions of T; the start and the end are always evaluated.
+            whose mean the model becomes (`turbogs_plugin.train.parameter_mean`). 0: the model of the last iteration.
+        evaluate_at: times of evaluations, as fractions of T; the start and the end are always evaluated.
         checkpoint_every: iterations between checkpoints; the end always has one. 0: only the end.
     """
 
     iterations: int | Auto = 5000
     epochs: float = 60.0
-    base_iterations: int = 5000
     batch_for: int | Auto = 1
     refine_until: int = 3500
     seed: int = 0
@@ -117,11 +144,10 @@ class TrainConfig:
     checkpoint_every: int = 10_000
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "base_iterations"):
-            value = getattr(self, name)
-            require(value == "auto" or 1 <= value < 2**31, name, value, "within 1 .. 2^31 - 1")
+        countable = isinstance(self.iterations, str) or 1 <= self.iterations < 2**31
+        require(countable, "iterations", self.iterations, "within 1 .. 2^31 - 1")
         require(math.isfinite(self.epochs) and self.epochs > 0, "epochs", self.epochs, "a finite number above 0")
-        require(self.batch_for == "auto" or self.batch_for >= 1, "batch_for", self.batch_for, "at least 1")
+        require(isinstance(self.batch_for, str) or self.batch_for >= 1, "batch_for", self.batch_for, "at least 1")
         require(self.refine_until >= 0, "refine_until", self.refine_until, "at least 0")
         require(0 <= self.seed < 2**31, "seed", self.seed, "within 0 .. 2^31 - 1")
         require(self.device in ("auto", "cpu", "cuda"), "device", self.device, "auto, cpu or cuda")
@@ -133,7 +159,9 @@ class TrainConfig:
         require(self.sh_interval >= 1, "sh_interval", self.sh_interval, "at least 1")
         require(0 < self.initial_opacity < 1, "initial_opacity", self.initial_opacity, "more than 0 and less than 1")
         require(0 < self.initial_size <= 100, "initial_size", self.initial_size, "more than 0 and at most 100")
-        require(self.dropout == "auto" or 0 <= self.dropout < 1, "dropout", self.dropout, "at least 0, less than 1")
+        require(
+            isinstance(self.dropout, str) or 0 <= self.dropout < 1, "dropout", self.dropout, "at least 0, less than 1"
+        )
         require_not_negative(self, "distant_size")
         require(0 <= self.average_last <= 1, "average_last", self.average_last, "within 0 .. 1")
         for value in self.evaluate_at:
@@ -142,8 +170,8 @@ class TrainConfig:
 
     @property
     def written_iterations(self) -> int:
-        """The length of run that the settings which count iterations are written for."""
-        return self.base_iterations if self.iterations == "auto" else self.iterations
+        """Iterations for which the settings that count iterations are written."""
+        return WRITTEN_FOR if isinstance(self.iterations, str) else self.iterations
 
     @property
     def starts_from_model(self) -> bool:
@@ -152,7 +180,8 @@ class TrainConfig:
 
     def evaluation_iterations(self) -> set[int]:
         """Counts of finished iterations after which to evaluate."""
-        return {0, self.iterations, *(max(1, round(part * self.iterations)) for part in self.evaluate_at)}
+        total = self.written_iterations
+        return {0, total, *(max(1, round(part * total)) for part in self.evaluate_at)}
 
     def sh_degree_at(self, iteration: int) -> int:
         """Degree of the bands in use at an iteration."""
@@ -161,7 +190,11 @@ class TrainConfig:
 
 @dataclass
 class MapsConfig:
-    """The error maps. `beta`: EMA weight of a new error."""
+    """The error maps.
+
+    Args:
+        beta: weight of a new error in the moving average of the errors at its pixel.
+    """
 
     beta: float = 0.4
 
@@ -174,18 +207,13 @@ class ReportConfig:
     """The report.
 
     Args:
-        lpips_weights: a local file with the backbone's weights (torchvision's VGG16), or null: LPIPS is not computed.
-        strips: test views shown as pictures, at most.
-        tensorboard: also write the history and those pictures for TensorBoard, at each evaluation, into the run's
-            folder; needs the extra ``tensorboard``.
+        lpips_weights: local file with the backbone's weights (torchvision's VGG16), or null: LPIPS is not computed.
+        tensorboard: also write the history and pictures of test views for TensorBoard, into the run's folder at each
+            evaluation; needs the extra ``tensorboard``.
     """
 
     lpips_weights: str | None = None
-    strips: int = 8
     tensorboard: bool = False
-
-    def __post_init__(self) -> None:
-        require(self.strips >= 0, "strips", self.strips, "at least 0")
 
 
 @dataclass
@@ -193,7 +221,7 @@ class BudgetConfig:
     """What the run may take besides Gaussians, whose cap is the density control's `max_gaussians`.
 
     Args:
-        max_memory: of the device, for instance 2GiB; empty: no limit.
+        max_memory: most memory of the device, for instance 2GiB; empty: no limit.
         time: seconds of training to end after, for instance 20s or 2m; empty: `train.iterations` decide.
     """
 
@@ -211,3 +239,45 @@ class BudgetConfig:
     def seconds(self) -> float | None:
         """`time`, or None for no limit. Raises `InputError` where it is no amount."""
         return parse_seconds(self.time) if self.time else None
+
+
+def undecided(mapping: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The settings of a complete configuration that are left to a plan."""
+    return [setting for setting in AUTO_SETTINGS if value_of(mapping, setting) == AUTO]
+
+
+def value_of(mapping: Mapping[str, Mapping[str, Any]], setting: str) -> Any:
+    """The value of ``section.key``."""
+    section, key = setting.split(".")
+    return mapping[section][key]
+
+
+BYTE_UNITS = {"": 1, "b": 1, "kib": 2**10, "mib": 2**20, "gib": 2**30, "kb": 10**3, "mb": 10**6, "gb": 10**9}
+SECOND_UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+
+
+def parse_bytes(text: str) -> int:
+    """``2GiB``, ``1500 MB``, ``300000000``. Raises `InputError`."""
+    return int(_parse(text, BYTE_UNITS, 1.0, "memory: write 2GiB, 1500MB or a number of bytes"))
+
+
+def parse_seconds(text: str) -> float:
+    """``20s``, ``2m``, ``1.5h``, ``20``. Raises `InputError`."""
+    return _parse(text, SECOND_UNITS, 1e-9, "time: write 20s, 2m or 1.5h")
+
+
+def parse_color(text: str) -> Color:
+    """``white``, ``rgb(51, 102, 153)``, ``#336699``, as Pillow's `ImageColor` takes them. Raises `InputError`."""
+    try:
+        red, green, blue = ImageColor.getrgb(text)[:3]
+    except ValueError:
+        raise InputError(f"'{text[:40]}' is no colour: write black, white, grey or rgb(51, 102, 153)") from None
+    return red / 255.0, green / 255.0, blue / 255.0
+
+
+def _parse(text: str, units: Mapping[str, float], least: float, expected: str) -> float:
+    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", text.lower())
+    amount = float(match[1]) * units.get(match[2], math.nan) if match else math.nan
+    if not least <= amount < math.inf:
+        raise InputError(f"'{text[:40]}' is no amount of {expected}")
+    return amount

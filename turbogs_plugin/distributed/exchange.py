@@ -35,7 +35,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbogs_plugin.device import current_stream
 from turbogs_plugin.distributed.digest import digest
 from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
@@ -247,7 +246,7 @@ class RankExchange(Exchange):
             self._buffers = [(values, torch.cuda.Event()) for values in pinned]
         values, event = self._buffers[self._passes % len(self._buffers)]
         values.copy_(flags, non_blocking=True)
-        event.record(current_stream(flags.device))
+        event.record(torch.cuda.current_stream(flags.device))
         return _Flags(self._passes, values, event)
 
     def settle(self, engine: Engine, wait: bool = False) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from torch import Tensor
@@ -141,24 +141,24 @@ class RasterSettings:
     """The constants of gsplat's `rasterization`; a model trained with them is a normal gsplat model.
 
     Args:
-        eps2d: added to the diagonal of the projected covariance, pixels squared; 0 or more.
+        eps2d: blur, added to the diagonal of the projected covariance, pixels squared; 0 or more.
         near_plane, far_plane: depths outside are not drawn, world units; 0 < near_plane < far_plane.
         alpha_min: a splat with less opacity at a pixel is skipped there. At least exp(-3.33^2 / 2), about 0.00391.
             Below that the engines would differ: the reference cuts splats at 3.33 standard deviations, the CUDA kernels
             where they reach alpha_min.
         alpha_max: opacity at a pixel is limited to this (without a gradient beyond); between alpha_min and 1.
-        transmittance_min: a pixel ends before the splat that would bring its transmittance to this or below; between 0
-            and 1.
+        transmittance_min: transmittance of a pixel that ends it, before the splat that would bring it to this or below;
+            between 0 and 1. The only one that a configuration sets.
 
     Raises:
         InputError: a value outside these bounds.
     """
 
-    eps2d: float = 0.3
-    near_plane: float = 0.01
-    far_plane: float = 1e10
-    alpha_min: float = 1.0 / 255.0
-    alpha_max: float = 0.999
+    eps2d: float = field(default=0.3, metadata={"setting": False})
+    near_plane: float = field(default=0.01, metadata={"setting": False})
+    far_plane: float = field(default=1e10, metadata={"setting": False})
+    alpha_min: float = field(default=1.0 / 255.0, metadata={"setting": False})
+    alpha_max: float = field(default=0.999, metadata={"setting": False})
     transmittance_min: float = 1e-4
 
     def __post_init__(self) -> None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from gsplat.strategy import DefaultStrategy
-from gsplat.strategy.ops import _update_param_with_optimizer
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError, require
@@ -23,9 +22,9 @@ from turbogs_plugin.gsplat_bridge.host import (
     require_keys,
     require_one_process,
 )
+from turbogs_plugin.gsplat_bridge.optimizer_swap import COUNT, MemberOptimizer
 from turbogs_plugin.gsplat_bridge.tuned import TUNED_DENSITY
 from turbogs_plugin.model.row_order import in_order_of_space
-from turbogs_plugin.strategies.checks import shared_settings
 from turbogs_plugin.strategies.density.error_driven import FINAL_PRUNINGS, ErrorDrivenDensity
 from turbogs_plugin.strategies.density.rows import add_stats
 from turbogs_plugin.types import GaussianStats, RowUpdate, Step
@@ -76,12 +75,12 @@ class TurboDensityStrategy(DefaultStrategy):
     absgrad: bool = True
     grow_absgrad2d: float = TUNED_DENSITY.absgrad_threshold
     lambda_base: float = TUNED_DENSITY.lambda_base
-    score: str = TUNED_DENSITY.score
+    score: Literal["balanced", "raw"] = TUNED_DENSITY.score
     top_fraction: float = TUNED_DENSITY.top_fraction
-    split: str = TUNED_DENSITY.split
+    split: Literal["sample", "long_axis"] = TUNED_DENSITY.split
     max_gaussians: int = TUNED_DENSITY.max_gaussians
     prune_score_fraction: float = TUNED_DENSITY.prune_score_fraction
-    choose_by: str = TUNED_DENSITY.choose_by
+    choose_by: Literal["difficulty", "squares"] = TUNED_DENSITY.choose_by
     opacity_decay: float = TUNED_DENSITY.opacity_decay
     final_every: int = TUNED_DENSITY.final_every
     final_keep: float = TUNED_DENSITY.final_keep
@@ -109,7 +108,7 @@ class TurboDensityStrategy(DefaultStrategy):
             raise InputError(WITHOUT_GRADIENT)
         super().step_pre_backward(params, optimizers, state, step, info)
         for optimizer in optimizers.values():
-            if hasattr(optimizer, "observe"):
+            if isinstance(optimizer, MemberOptimizer):
                 optimizer.observe(info)
 
     @torch.no_grad()
@@ -209,8 +208,18 @@ class TurboDensityStrategy(DefaultStrategy):
     def _controller(self, step: int) -> ErrorDrivenDensity:
         """The controller with the present values of all fields."""
         return ErrorDrivenDensity(
-            **shared_settings(self, ErrorDrivenDensity),
             refine_from=self.refine_start_iter + 1,
+            refine_every=self.refine_every,
+            lambda_base=self.lambda_base,
+            score=self.score,
+            top_fraction=self.top_fraction,
+            split=self.split,
+            max_gaussians=self.max_gaussians,
+            prune_score_fraction=self.prune_score_fraction,
+            choose_by=self.choose_by,
+            opacity_decay=self.opacity_decay,
+            final_every=self.final_every,
+            final_keep=self.final_keep,
             grad_threshold=self.grow_grad2d,
             absgrad_threshold=self.grow_absgrad2d,
             percent_dense=self.grow_scale3d,
@@ -234,19 +243,22 @@ def apply_row_update(
             which `GaussianScene` keeps `component_index` and `signal`: row i becomes a copy of old row `source[i]`.
     """
     count = len(params["means"])
-
-    def new_parameter(name: str, parameter: Tensor) -> torch.nn.Parameter:
+    for name, parameter in [*params.items()]:
         value = parameter[update.source]
         if name in update.values:
             value = update.values[name].reshape(value.shape)  # a host's own layout
-        return torch.nn.Parameter(value, requires_grad=parameter.requires_grad)
-
-    _update_param_with_optimizer(new_parameter, lambda key, value: update.apply_state(value), params, optimizers)
-    if update.reset:
-        names = list(update.reset)
-        _update_param_with_optimizer(
-            lambda _, value: value, lambda _, value: torch.zeros_like(value), params, optimizers, names
-        )
+        replaced = torch.nn.Parameter(value, requires_grad=parameter.requires_grad)
+        params[name] = replaced
+        if name in optimizers:
+            optimizer = optimizers[name]
+            rows = optimizer.state.pop(parameter, {})
+            for key in rows.keys() - {COUNT}:
+                rows[key] = update.apply_state(rows[key])
+                if name in update.reset:
+                    rows[key].zero_()
+            optimizer.state[replaced] = rows
+            for group in optimizer.param_groups:
+                group["params"] = [replaced]
     for key, value in state.items():
         if isinstance(value, Tensor):
             state[key] = update.apply_state(value)

@@ -25,7 +25,7 @@ STATISTICS = "gaussian_stats"
 LOSS_SHARES = "loss_shares"
 """Key under which it leaves, beside them, [N] the Gaussians' shares of the loss."""
 
-LAYOUTS = {
+LAYOUTS: dict[str, list[tuple[str | int, ...]]] = {
     "means": [("N", 3)],
     "quats": [("N", 4)],
     "scales": [("N", 3)],
@@ -53,7 +53,7 @@ def require_one_process(swap: str) -> None:
         )
 
 
-def require_keys(mapping: Mapping[str, Any] | None, keys: Iterable[str], what: str, remedy: str) -> None:
+def require_keys(mapping: Mapping[str, Any] | Parameters | None, keys: Iterable[str], what: str, remedy: str) -> None:
     """Raise `InputError` naming the `keys` that `mapping` (called `what`) lacks; None lacks all of them."""
     if mapping is None:
         raise InputError(f"{what} is None: {remedy}")
@@ -62,7 +62,7 @@ def require_keys(mapping: Mapping[str, Any] | None, keys: Iterable[str], what: s
         raise InputError(f"{what} has no {', '.join(repr(key) for key in missing)}: {remedy}")
 
 
-def host_gaussians(params: Mapping[str, Tensor], names: Iterable[str] = PARAMETER_NAMES) -> Gaussians:
+def host_gaussians(params: Mapping[str, Tensor] | Parameters, names: Iterable[str] = PARAMETER_NAMES) -> Gaussians:
     """A host's parameters as `Gaussians`. The tensors share memory with the parameters and have no gradient.
 
     Args:
@@ -78,7 +78,7 @@ def host_gaussians(params: Mapping[str, Tensor], names: Iterable[str] = PARAMETE
     count = params["means"].shape[0]
     for name in [name for name in PARAMETER_NAMES if name in params]:
         shape = tuple(params[name].shape)
-        sizes = {"N": count, "B": shape[1] if len(shape) > 1 else None}
+        sizes: dict[Any, int | None] = {"N": count, "B": shape[1] if len(shape) > 1 else None}
         if shape not in [tuple(sizes.get(size, size) for size in layout) for layout in LAYOUTS[name]]:
             expected = ", ".join(map(str, LAYOUTS[name][0]))
             raise InputError(

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -26,6 +25,7 @@ from turbogs_plugin.engine.rules import ParameterRates
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
 from turbogs_plugin.gsplat_bridge.host import host_gaussians, require_one_process
+from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, Step
 
@@ -45,11 +45,12 @@ MOST_SKIPPED = 100
 """Iterations in a row that may be skipped. A `GradScaler` halves its scale at each, so it needs a few dozen at most."""
 
 
-@dataclass
-class _HostRates:
+class _HostRates(LearningRates):
     """The rates that the host's schedulers have set, whatever the step."""
 
-    rates: ParameterRates
+    def __init__(self, rates: ParameterRates) -> None:
+        super().__init__()
+        self.rates = rates
 
     def at(self, step: Step) -> ParameterRates:
         return self.rates
@@ -101,8 +102,8 @@ class SharedOptimizer:
             fused: taken for the sake of hosts that pass it; the update is one for all parameters in any case.
         """
         require_one_process("SharedOptimizer")
-        betas = (self.optimizer.beta1, self.optimizer.beta2) if betas is None else tuple(betas)
-        defaults = {"lr": lr, "betas": betas, "eps": self.optimizer.eps if eps is None else eps}
+        both = (self.optimizer.beta1, self.optimizer.beta2) if betas is None else tuple(betas)
+        defaults = {"lr": lr, "betas": both, "eps": self.optimizer.eps if eps is None else eps}
         member = MemberOptimizer(self, list(params), defaults)
         if member.name in self.members:
             raise InputError(f"there is a member for parameter '{member.name}' already: each name is given once")
@@ -172,13 +173,14 @@ class SharedOptimizer:
         if all(gradient is None for gradient in gradients.values()):
             return
         gaussians = host_gaussians({name: members[name].parameter for name in PARAMETER_NAMES})
+        given: dict[str, Tensor] = {}
         for name, value in gaussians.items():
             gradient = gradients[name]
-            gradients[name] = torch.zeros_like(value) if gradient is None else gradient.reshape(value.shape)
+            given[name] = torch.zeros_like(value) if gradient is None else gradient.reshape(value.shape)
         self._take_options()
         moments = self._pack(gaussians)
         self.optimizer.moments = moments
-        self.optimizer.step(gaussians, _one_row(gradients, self._shares(gaussians, info)), Step(0, 1, 1))
+        self.optimizer.step(gaussians, _one_row(given, self._shares(gaussians, info)), Step(0, 1, 1))
         for place, moment in self._moments(moments):
             moment.copy_(place.reshape(moment.shape))
         members["means"].checked_state()[COUNT] += 1
@@ -232,7 +234,7 @@ class SharedOptimizer:
         """[1, N] the Gaussians' share of the loss, zero where nothing is known of it."""
         shares = None if info is None else loss_shares(info, len(gaussians))
         if shares is None:
-            if not self._told and hasattr(self.optimizer, "rows"):
+            if not self._told and self.optimizer.lm is not None:
                 print(
                     f"{type(self.optimizer).__name__}: the Gaussians' shares of the loss are not known, so steps are "
                     "Adam's; put prediction and ground_truth into info before loss.backward(), and call "
@@ -290,7 +292,7 @@ class MemberOptimizer(torch.optim.Optimizer):
         self.shared.observe(info)
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]  # overloads
         """Hand the gradient over (``.grad`` is None afterwards); the last member to be stepped updates all.
 
         Where a backward ran before all members were stepped, as when a `GradScaler` left one out, what the others

@@ -28,6 +28,7 @@ from turbogs_plugin.gsplat_bridge.host import (
     STATISTICS,
     require_one_process,
 )
+from turbogs_plugin.strategies.protocols import SparseLoss
 from turbogs_plugin.types import SH_C0, TILE_SIZE, Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, Step
 
 LOGIT_MARGIN = 2.0**-23
@@ -130,14 +131,15 @@ def sparse_rasterization(
     info = _info(render, len(viewmats), width, height)
     observer.info = weakref.ref(info)
     alphas = render.alphas[:, None]  # [P, 1]
+    depths = alphas if render.depths is None else render.depths[:, None]  # [P, 1], where it was asked for
     if render_mode == "ED":
-        return render.depths[:, None], alphas, info
+        return depths, alphas, info
     rendered_colors = render.colors
     if backgrounds is not None:
         behind = backgrounds[samples.view_of_slot()] * samples.filled[:, None]  # [P, 3]
         rendered_colors = rendered_colors + (1.0 - alphas) * behind
     if render_mode == "RGB+ED":
-        rendered_colors = torch.cat([rendered_colors, render.depths[:, None]], dim=1)
+        rendered_colors = torch.cat([rendered_colors, depths], dim=1)
     return rendered_colors, alphas, info
 
 
@@ -162,7 +164,7 @@ def gather_pixels(images: Tensor, samples: PixelSamples) -> Tensor:
 
 
 def sparse_loss(
-    loss: Callable[[Tensor, Tensor, PixelSamples], LossOutput],
+    loss: SparseLoss,
     colors: Tensor,
     targets: Tensor,
     samples: PixelSamples,
@@ -172,7 +174,8 @@ def sparse_loss(
     """A `SparseLoss` as a scalar that `backward` can be called on: its own gradient is handed to autograd.
 
     Args:
-        loss: an instance, such as ``CharbonnierNccLoss()``.
+        loss: an instance, such as ``CharbonnierNccLoss()``. Without `maps`, any function of colours, targets and
+            samples that gives a `LossOutput`.
         colors, targets: [P, 3] float.
         maps, step: given both, `maps` takes in the samples' errors as visited at `step`, in the same launch where a
             kernel computes the loss. A sample whose colour or error is not finite changes nothing there.
@@ -187,13 +190,7 @@ def sparse_loss(
             raise InputError(f"{name} is {found}: expected floating point {(len(samples), 3)}, as there are samples")
     update = _map_update(maps, step, colors.device)
     given = (colors.detach(), targets.detach(), samples)
-    terms = None if update is None or isinstance(loss, type) else getattr(loss, "terms", None)
-    if terms is not None:
-        output = engine_of(colors.device).evaluate_and_learn(terms, *given, update)
-    else:
-        output = _call(loss, *given)
-        if update is not None:
-            engine_of(colors.device).learn(samples, given[0], output, update)
+    output = _call(loss, *given) if update is None else _evaluate_and_learn(loss, *given, update)
     return _Loss.apply(colors, output)
 
 
@@ -201,13 +198,32 @@ def _map_update(maps: ErrorMaps | None, step: Step | None, device: torch.device)
     """What is to be done with the errors; None if nothing."""
     if maps is None and step is None:
         return None
+    if isinstance(maps, ErrorMaps) and isinstance(step, Step):
+        if maps.errors.device != device:
+            raise InputError(f"maps are on {maps.errors.device}: expected {device} as colors")
+        return MapUpdate(maps, step)
     for name, value, kind in (("maps", maps, ErrorMaps), ("step", step, Step)):
         if not isinstance(value, kind):
             other = "step" if name == "maps" else "maps"
             raise InputError(f"{name} is a {type(value).__name__}: expected {kind.__name__}, as {other} is given")
-    if maps.errors.device != device:
-        raise InputError(f"maps are on {maps.errors.device}: expected {device} as colors")
-    return MapUpdate(maps, step)
+    return None
+
+
+def _evaluate_and_learn(
+    loss: SparseLoss, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
+) -> LossOutput:
+    """The output of a loss on samples, whose errors the maps take in."""
+    engine = engine_of(colors.device)
+    try:
+        terms = loss.terms
+    except AttributeError:
+        name = type(loss).__name__
+        raise InputError(f"{name} has no terms: inherit from strategies.SparseLoss, or set terms = None") from None
+    if terms is not None:
+        return engine.evaluate_and_learn(terms, colors, targets, samples, update)
+    output = _call(loss, colors, targets, samples)
+    engine.learn(samples, colors, output, update)
+    return output
 
 
 def _call(loss: Any, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:

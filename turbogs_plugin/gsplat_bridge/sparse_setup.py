@@ -68,7 +68,8 @@ def maps_of_photos(
             "samples are few pixels of a whole image already"
         )
     # Not iterated: a data set without __iter__ would be read past its end.
-    errors, masks = [], []
+    errors: list[torch.Tensor] = []
+    masks: list[torch.Tensor | None] = []
     for number in range(len(trainset)):
         item = trainset[number]
         image = item["image"]
@@ -80,5 +81,5 @@ def maps_of_photos(
     if all(mask is None for mask in masks):
         return ErrorMaps.from_images(errors)
     whole = (torch.ones(image.shape, dtype=torch.bool) for image in errors)
-    masks = [every if mask is None else mask for every, mask in zip(whole, masks, strict=True)]
-    return ErrorMaps.from_images(errors, masks)
+    counted = [every if mask is None else mask for every, mask in zip(whole, masks, strict=True)]
+    return ErrorMaps.from_images(errors, counted)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from typing import Any
-
-import yaml
 
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.schedule import SinusoidalSchedule
+from turbogs_plugin.yaml_json import read_named_yaml
 
-# Read with the YAML library alone, as a host's trainer need not have more installed.
-_TURBOGS = yaml.safe_load((resources.files("turbogs_plugin.configs") / "turbogs.yaml").read_text(encoding="utf-8"))
+_TURBOGS = read_named_yaml("turbogs", "turbogs_plugin.configs", "config")
 
 
 def _settings(section: str) -> dict[str, Any]:
@@ -26,7 +23,7 @@ GATES = {
     "absgrad_threshold": 2e-4,
     "final_keep": 1.0,
 }
-"""In place of turbogs' draw by squares, which gsplat's rasterization does not give; and no final pruning.
+"""Settings in place of turbogs' draw by squares, which gsplat's rasterization does not give, and of final pruning.
 docs/drop-in.md was measured so."""
 
 TUNED_DENSITY = ErrorDrivenDensity(**_settings("density") | GATES)

@@ -9,9 +9,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from turbogs_plugin.config.auto import AUTO, value_of
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import RATE_EXPONENT
+from turbogs_plugin.config.sections import AUTO, WRITTEN_FOR, value_of
 from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.caps import cap_of
@@ -164,7 +164,7 @@ def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
     batch = decide("train.batch_for", facts, config)
     factor = batch.value if batch.made == "auto" else 1  # what is set is in the schedule already
     wanted = train.epochs * views / (factor * images_per_iteration(config, views))
-    fewest = SHORTEST_SHARE * train.base_iterations / factor**RATE_EXPONENT
+    fewest = SHORTEST_SHARE * WRITTEN_FOR / factor**RATE_EXPONENT
     longest = max(LONGEST / factor, fewest)
     given = min(max(wanted, fewest), longest)
     reason = f"{train.epochs:g} epochs of {views} training views"

@@ -8,14 +8,14 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from turbogs_plugin.config.auto import AUTO
 from turbogs_plugin.config.configuration import Config, resolve
 from turbogs_plugin.config.scaling import with_batch_for, with_iterations
-from turbogs_plugin.config.schema import build_dataclass
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.config.sections import AUTO
+from turbogs_plugin.config.typed import build_dataclass
 from turbogs_plugin.plan.decisions import RULES, Decision, decide, mebibytes
 from turbogs_plugin.plan.facts import SceneFacts, gather_facts
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.yaml_json import parse_json
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,7 @@ class Plan:
     @classmethod
     def from_json(cls, text: str) -> Plan:
         """Raises `InputError` where the text is not a plan's."""
-        try:
-            mapping = json.loads(text)
-        except ValueError as error:
-            raise InputError(f"the plan is not JSON: {error}") from None
-        return build_dataclass(cls, mapping, "plan")
+        return build_dataclass(cls, parse_json(text, "the plan"), "plan")
 
 
 def make_plan(config: Config, scene: Scene, device: torch.device, processes: int = 1) -> Plan:

@@ -6,6 +6,7 @@ import platform
 import shlex
 from pathlib import Path
 
+from turbogs_plugin.config.sections import STRIPS
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip
@@ -32,7 +33,7 @@ def write_report(run: RunSession) -> Path:
     run.clock.mark("report")
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
-    strips = min(len(run.test), config.report.strips)
+    strips = min(len(run.test), STRIPS)
     for view_id in range(strips):
         image = render_view(trainer.gaussians, run.test, view_id, look)
         photo = run.test.photos.image(view_id, look.background)

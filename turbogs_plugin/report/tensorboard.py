@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.config.sections import STRIPS
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.images import strip
 from turbogs_plugin.scene import PosedImages
@@ -64,7 +65,7 @@ class EventWriter(Listener):
     def of_run(cls, session: RunSession) -> EventWriter:
         """The writer of a run, new or resumed: a resumed run's history ends at its checkpoint."""
         first = session.trainer.iteration + 1 if session.resumed else 0
-        return cls(session.folder.tensorboard, session.test, session.trainer.config.report.strips, first)
+        return cls(session.folder.tensorboard, session.test, STRIPS, first)
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         iteration = evaluation.iteration

@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.device import current_stream, synchronize
+from turbogs_plugin.device import synchronize
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene import PosedImages
@@ -313,13 +313,13 @@ class _CopyStream:
 
 def _mark(device: torch.device) -> list[torch.cuda.Event]:
     """The end of the work enqueued so far on the current stream; empty on a CPU."""
-    return [current_stream(device).record_event()] if device.type == "cuda" else []
+    return [torch.cuda.current_stream(device).record_event()] if device.type == "cuda" else []
 
 
 def _wait(device: torch.device, events: Sequence[torch.cuda.Event]) -> None:
     """Work enqueued from now on on the current stream comes after these."""
     for event in dict.fromkeys(events):
-        current_stream(device).wait_event(event)
+        torch.cuda.current_stream(device).wait_event(event)
 
 
 def _page_lock(window: ViewWindow) -> None:

@@ -19,9 +19,9 @@ from pathlib import Path
 
 from turbogs_plugin.config.configuration import Config, load_config, named_beside
 from turbogs_plugin.config.scaling import with_iterations
-from turbogs_plugin.config.schema import build_dataclass, nearest
-from turbogs_plugin.config.yaml_text import read_named_yaml
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.config.typed import build_dataclass
+from turbogs_plugin.errors import InputError, nearest
+from turbogs_plugin.yaml_json import read_named_yaml
 
 PACKAGE = "turbogs_plugin.configs.ablations"
 """Where the packaged ablations are."""

@@ -14,7 +14,7 @@ from typing import Any
 
 from torch import Tensor
 
-from turbogs_plugin.config.units import parse_color
+from turbogs_plugin.config.sections import parse_color
 from turbogs_plugin.engine.reference.philox import PURPOSE_BACKGROUND, host_words
 from turbogs_plugin.engine.rendering import RasterSettings
 from turbogs_plugin.scene.sequence import Neighbours, PhotoOrder

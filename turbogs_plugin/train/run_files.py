@@ -6,11 +6,11 @@ import shlex
 from pathlib import Path
 
 from turbogs_plugin.config.configuration import Config, resolve_complete
-from turbogs_plugin.config.yaml_text import read_yaml
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable
 from turbogs_plugin.plan import Plan
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
+from turbogs_plugin.yaml_json import read_yaml
 
 
 class RunFolder:

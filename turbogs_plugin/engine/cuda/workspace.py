@@ -20,7 +20,6 @@ from weakref import ref
 import torch
 from torch import Tensor
 
-from turbogs_plugin.device import current_stream
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX, PassStatus
 from turbogs_plugin.engine.protocol import PassMemory
 from turbogs_plugin.errors import InputError
@@ -220,7 +219,7 @@ class Workspace:
             self._events[place] = torch.cuda.Event()
         values, event = self._pinned[place], self._events[place]
         values.copy_(self.status, non_blocking=True)
-        event.record(current_stream(self.device))
+        event.record(torch.cuda.current_stream(self.device))
         self._pending.append(_Pending(self.passes, tiles, event, values))
         self.passes += 1
 

@@ -1,7 +1,12 @@
-"""Reading YAML from untrusted sources: plain values only, in bounded memory."""
+"""YAML and JSON from untrusted sources, read as plain values in bounded memory; and YAML as it is written.
+
+Every module that reads or writes YAML or JSON goes through this one.
+"""
 
 from __future__ import annotations
 
+import json
+import re
 from copy import deepcopy
 from functools import lru_cache
 from importlib import resources
@@ -9,17 +14,48 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from turbogs_plugin.config.schema import nearest
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.errors import InputError, nearest
 
 SIZE_LIMIT = 64 * 1024
-"""Bytes of a configuration file. Ours have about three thousand."""
+"""Bytes of a configuration file. The packaged ones have about three thousand."""
 
 DEPTH_LIMIT = 16
 """Levels of nesting, well above what any configuration has."""
+
+JSON_LIMIT = 256 * 2**20
+"""Bytes of a JSON text. A photo of a transforms.json takes about one thousand."""
+
+FLOAT = re.compile(
+    r"""[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?  # 0.25, 1e-4, .5
+    |[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)""",
+    re.VERBOSE,
+)
+"""A number of YAML 1.2. PyYAML's own rule, of YAML 1.1, takes 1e-4 for text."""
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader with numbers of YAML 1.2, dates as text, and no key twice."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 - PyYAML's own form
+        first: [(tag, rule) for tag, rule in rules if not tag.endswith(":timestamp")]
+        for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        result = super().construct_mapping(node, deep)
+        if len(result) < len(node.value):
+            raise yaml.constructor.ConstructorError(None, None, "a key is there twice", node.start_mark)
+        return result
+
+
+class _Dumper(yaml.SafeDumper):
+    """PyYAML's safe dumper, with quotes around text that `_Loader` would take for a number."""
+
+
+_FLOAT = re.compile(f"(?:{FLOAT.pattern})$", re.VERBOSE)
+for _kind in (_Loader, _Dumper):
+    _kind.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, [*"-+.0123456789"])
 
 
 def packaged_names(package: str) -> list[str]:
@@ -70,7 +106,6 @@ def parse_yaml(text: str, where: str) -> dict[str, Any]:
     """The mapping in a YAML text, numbers as YAML 1.2 reads them (``1e-4`` is a float).
 
     Tags, anchors and aliases are refused before anything is built: they can run code or grow without bound.
-    ``${...}`` stays text.
 
     Args:
         where: what the text is, for messages: ``config 'my.yaml'``.
@@ -85,12 +120,12 @@ def parse_yaml(text: str, where: str) -> dict[str, Any]:
 def _parsed(text: str, where: str) -> dict[str, Any]:
     try:
         _refuse_unsafe(text, where)
-        return OmegaConf.to_container(OmegaConf.create(text), resolve=False)
-    except (yaml.YAMLError, OmegaConfBaseException, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        mark = getattr(error, "problem_mark", None)
+        return yaml.load(text, _Loader)
+    except InputError:
+        raise
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: a whole number of more digits than Python converts
+        mark = error.problem_mark if isinstance(error, yaml.MarkedYAMLError) else None
+        problem = error.problem if isinstance(error, yaml.MarkedYAMLError) else str(error).splitlines()[0]
         place = f" (line {mark.line + 1})" if mark else ""
         raise InputError(f"{where} is not valid YAML{place}: {problem}") from None
 
@@ -99,9 +134,9 @@ def _refuse_unsafe(text: str, where: str) -> None:
     depth, roots = 0, []
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         place = f"{where} (line {event.start_mark.line + 1})"
-        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
+        if isinstance(event, yaml.AliasEvent) or (isinstance(event, yaml.NodeEvent) and event.anchor):
             raise InputError(f"{place}: anchors and aliases are not allowed")
-        if getattr(event, "tag", None):
+        if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag:
             raise InputError(f"{place}: tags are not allowed: {event.tag}")
         if depth == 0 and isinstance(event, yaml.NodeEvent):
             roots.append(event)
@@ -113,3 +148,25 @@ def _refuse_unsafe(text: str, where: str) -> None:
     if not isinstance(roots[0], yaml.MappingStartEvent):
         found = f"the text '{roots[0].value[:40]}'" if isinstance(roots[0], yaml.ScalarEvent) else "a list"
         raise InputError(f"{where}: expected a mapping of sections, got {found}")
+
+
+def yaml_text(mapping: dict[str, Any]) -> str:
+    """A mapping of plain values as YAML, in its own order; `parse_yaml` gives the mapping back."""
+    return yaml.dump(mapping, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+
+
+def parse_json(text: str, where: str) -> Any:
+    """The value in a JSON text.
+
+    Args:
+        where: what the text is, for messages: ``'transforms.json'``.
+
+    Raises:
+        InputError: larger than `JSON_LIMIT`, not JSON, or nested more deeply than Python's parser follows.
+    """
+    if len(text) > JSON_LIMIT:
+        raise InputError(f"{where} has more than {JSON_LIMIT} bytes")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{where} is not valid JSON: {error}") from None

@@ -1,0 +1,154 @@
+"""Strategies by name: built-in ones, and those of others."""
+
+import importlib.metadata
+import sys
+from pathlib import Path
+
+import pytest
+
+from turbogs_plugin.config import components
+from turbogs_plugin.config.components import build
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.config.scaling import with_iterations
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies import TYPES
+
+MODULE = """
+from dataclasses import dataclass
+from turbogs_plugin.strategies import DensityController
+
+@dataclass
+class MySampler:
+    share: float = 0.1
+
+    def __post_init__(self):
+        if self.share > 1:
+            raise ValueError(f"share = {self.share} is too much")
+
+    def sample(self, maps, view_ids, rate, step): ...
+
+@dataclass
+class MyLoss:
+    def __call__(self, colors, targets, samples): ...
+
+@dataclass
+class Fading(DensityController):
+    opacity_decay: float = 0.2
+
+    def update(self, gaussians, step): ...
+
+@dataclass
+class Half:
+    def setup(self, gaussians): ...
+    def update(self, gaussians, step): ...
+
+@dataclass
+class Unresolved:
+    value: "Absent" = None
+
+class Outer:
+    Inner = MySampler
+
+class Plain:
+    sample = MySampler.sample
+
+number, function, instance = 5, lambda: MySampler(), MySampler()
+"""
+
+
+@pytest.fixture(autouse=True)
+def module_here(monkeypatch, tmp_path):
+    """A module in the current folder, which Python's own path does not have."""
+    (tmp_path / "third_party.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry not in ("", str(tmp_path))])
+    yield
+    sys.modules.pop("third_party", None)
+
+
+@pytest.fixture
+def plug_in(monkeypatch):
+    """Register a class by entry point."""
+
+    def plug_in(kind: str, name: str, value: str) -> None:
+        point = importlib.metadata.EntryPoint(name, value, f"turbogs.{kind}")
+        monkeypatch.setattr(components, "entry_points", lambda group: [point] if group == f"turbogs.{kind}" else [])
+        monkeypatch.syspath_prepend(".")
+
+    return plug_in
+
+
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, types in TYPES.items() for name in types])
+def test_every_name_builds_with_its_defaults(kind, name):
+    assert type(build(kind, {"type": name})).__name__ == TYPES[kind][name].partition(":")[2]
+
+
+def test_an_entry_point_is_a_type(plug_in):
+    plug_in("pixel_sampler", "few", "third_party:Outer.Inner")
+    assert build("pixel_sampler", {"type": "few", "share": 0.5}).share == 0.5
+    with pytest.raises(InputError, match=r"unknown loss\.type"):
+        build("loss", {"type": "few"})
+    plug_in("pixel_sampler", "dense", "third_party:MySampler")
+    assert type(build("pixel_sampler", {"type": "dense"})).__name__ == "DensePixelSampler"
+
+
+@pytest.mark.parametrize("value", ["no_such_module:X", "third_party:Absent", "not a place"])
+def test_a_broken_entry_point_is_named(plug_in, value):
+    plug_in("pixel_sampler", "few", value)
+    with pytest.raises(InputError, match=f"few.*{value}.*cannot be imported"):
+        build("pixel_sampler", {"type": "few"})
+
+
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ("x = (", "SyntaxError"),
+        ("import sys; sys.exit(0)", "SystemExit"),
+        ("raise RuntimeError('two\\nlines')", "RuntimeError: two lines"),
+    ],
+)
+def test_a_module_that_breaks_as_it_is_imported_is_named(source, reason):
+    Path("breaking.py").write_text(source)
+    with pytest.raises(InputError, match=f"breaking:X.*cannot be imported: {reason}"):
+        build("pixel_sampler", {"type": "breaking:X"})
+
+
+REFUSED = [
+    ("loss", {"type": "charbonier"}, "did you mean 'charbonnier'"),
+    ("loss", {"type": 5}, "unknown loss.type '5'"),
+    ("losses", {}, "did you mean 'loss'"),
+    ("schedule", {"type": "fixed", "view": 1}, "did you mean 'views'"),
+    ("schedule", ["fixed"], "expected a mapping"),
+    ("pixel_sampler", {"type": "no_such_module:X"}, "'no_such_module:X'.*cannot be imported: ModuleNotFoundError"),
+    ("pixel_sampler", {"type": "third_party:"}, "cannot be imported"),
+    ("pixel_sampler", {"type": "os:sep"}, "'os:sep' .*is not a dataclass"),
+    *(("pixel_sampler", {"type": f"third_party:{x}"}, "not a dataclass") for x in ("function", "instance", "Plain")),
+    ("pixel_sampler", {"type": "third_party:MySampler", "shar": 1}, "did you mean 'share'"),
+    ("pixel_sampler", {"type": "third_party:MySampler", "share": 2.0}, "pixel_sampler: share = 2.0 is too much"),
+    ("pixel_sampler", {"type": "third_party:Unresolved"}, "a type of Unresolved's fields.*Absent"),
+    ("loss", {"type": "third_party:MySampler"}, "is no SparseLoss: it lacks __call__; inherit from"),
+    ("density", {"type": "third_party:Half"}, "lacks stats, event_due, growth_room, apply, state_dict, load_state"),
+]
+
+
+@pytest.mark.parametrize(("kind", "mapping", "words"), REFUSED)
+def test_what_does_not_fit_is_refused(kind, mapping, words):
+    with pytest.raises(InputError, match=words):
+        build(kind, mapping)
+
+
+def test_a_class_that_does_not_inherit_has_the_defaults_of_its_protocol():
+    assert build("pixel_sampler", {"type": "third_party:MySampler"}).heeds_masks is False
+    assert build("loss", {"type": "third_party:MyLoss"}).terms is None
+
+
+def test_a_decay_without_an_interval_may_be_scaled():
+    config = load_config("turbogs", ["density.type=third_party:Fading"])
+    assert with_iterations(config, 500).density == {"type": "third_party:Fading", "opacity_decay": 0.2}
+
+
+def test_a_type_may_be_a_class_in_a_file():
+    Path("mine.yaml").write_text("base: demo\npixel_sampler: {type: 'third_party:MySampler', share: 0.3}\n")
+    from_yaml = load_config("mine.yaml")
+    overridden = load_config("demo", ["pixel_sampler.type=third_party:MySampler", "pixel_sampler.share=0.3"])
+    assert from_yaml == overridden and from_yaml.build("pixel_sampler").share == 0.3

@@ -1,0 +1,89 @@
+"""Names of strategies to classes: the built-in ones, and those that others register by entry point.
+
+A third party adds to its ``pyproject.toml``::
+
+    [project.entry-points."turbogs.pixel_sampler"]
+    my_sampler = "my_package.samplers:MySampler"
+
+and a YAML names it by ``pixel_sampler: {type: my_sampler, ...}``. Without a package, a YAML names the class itself,
+``pixel_sampler: {type: my_samplers:MySampler, ...}``; the module may be a file in the current folder. Nothing is
+imported before it is named.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from turbogs_plugin.config.typed import build_dataclass
+from turbogs_plugin.errors import InputError, nearest
+from turbogs_plugin.strategies import PROTOCOLS, TYPES, protocols
+
+KINDS = tuple(TYPES)
+
+
+def default_type(kind: str) -> str:
+    """The type that a configuration without a section of this kind gets."""
+    return next(iter(TYPES[kind]))
+
+
+def strategy_class(kind: str, name: Any) -> type:
+    """The class behind a type's name, or the class ``module:Class`` itself.
+
+    Raises:
+        InputError: an unknown name (naming the nearest and all that are known), one whose module cannot be imported,
+            or one of something else than a dataclass.
+    """
+    known = {own: f"turbogs_plugin.strategies.{place}" for own, place in TYPES[kind].items()}
+    if isinstance(name, str) and ":" in name:
+        known = {name: name}
+        if not {"", os.getcwd()} & {*sys.path}:
+            sys.path.append(os.getcwd())  # last, so that a file here hides no installed module
+    elif name not in known:  # entry points stand in the files of every installed package
+        known = {point.name: point.value for point in entry_points(group=f"turbogs.{kind}")} | known
+    if name not in known:
+        raise InputError(f"unknown {kind}.type '{name}': {nearest(name, known)}; another's needs its package installed")
+    place = f"{kind}.type '{name}' ({known[name]})"
+    try:
+        found = EntryPoint(name, known[name], f"turbogs.{kind}").load()
+    except (Exception, SystemExit) as error:  # another's module can do anything as it is imported
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        if isinstance(error, ModuleNotFoundError):
+            reason += "; call this in the folder that the module lies in, name that in PYTHONPATH, or install it"
+        raise InputError(f"{place} cannot be imported: {reason}") from error
+    if not (isinstance(found, type) and is_dataclass(found)):
+        raise InputError(f"{place} is not a dataclass, whose init fields would be its configuration")
+    return found
+
+
+def build(kind: str, mapping: Any) -> Any:
+    """A new strategy from ``{"type": name, **its init fields}``.
+
+    Raises:
+        InputError: an unknown kind, type or key, a wrong type of a value, one out of range, or a class without what
+            its kind's protocol has.
+    """
+    if kind not in TYPES:
+        raise InputError(f"unknown kind of strategy '{kind}': {nearest(kind, KINDS)}")
+    if not isinstance(mapping, Mapping):
+        raise InputError(f"{kind}: expected a mapping with a 'type', got {mapping!r}")
+    type_name = mapping.get("type", default_type(kind))
+    found = strategy_class(kind, type_name)
+    options = {key: value for key, value in mapping.items() if key != "type"}
+    strategy: Any = build_dataclass(found, options, kind, also=("type",))
+    # Run-time state counts as present, and no value is read: reading may need `setup`.
+    present = {*dir(found), *(field.name for field in fields(strategy))}
+    protocol = getattr(protocols, PROTOCOLS[kind])
+    members = {name: value for name, value in vars(protocol).items() if name[0] != "_" or name == "__call__"}
+    absent = {name: value for name, value in members.items() if name not in present}
+    missing = [name for name, value in absent.items() if callable(value) or isinstance(value, property)]
+    if missing:
+        remedy = f"inherit from turbogs_plugin.strategies.{PROTOCOLS[kind]} for the defaults, and write the rest"
+        raise InputError(f"{kind}.type '{type_name}' is no {PROTOCOLS[kind]}: it lacks {', '.join(missing)}; {remedy}")
+    for attribute, default in absent.items():
+        setattr(strategy, attribute, default)
+    return strategy

@@ -1,0 +1,140 @@
+"""Mappings (from YAML) to dataclasses, strictly: unknown keys and wrong types are errors that name the place.
+
+A dataclass is its own configuration: its init fields are the keys, their hints the types, their defaults the only
+defaults. A field with ``metadata={"setting": False}`` is for callers in Python alone. OmegaConf's structured
+configurations know neither `Literal` nor unions with it (``int | Literal["auto"]``).
+"""
+
+from __future__ import annotations
+
+import math
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import cache
+from typing import Any, Literal, TypeVar
+
+from turbogs_plugin.errors import InputError, nearest
+
+T = TypeVar("T")
+UNIONS = (typing.Union, types.UnionType)
+NAMES = {float: "a number", int: "a whole number", bool: "true or false", str: "text", type(None): "null"}
+"""Type -> what it is called in messages."""
+
+
+def settings_of(cls: type) -> dict[str, Field[Any]]:
+    """The fields of a dataclass that a configuration may set, by name."""
+    return {field.name: field for field in fields(cls) if field.init and field.metadata.get("setting", True)}
+
+
+def build_dataclass(cls: type[T], mapping: Any, where: str, also: Iterable[str] = ()) -> T:
+    """An instance of dataclass `cls` from a mapping of its settings; those not named keep their defaults.
+
+    Args:
+        cls: a dataclass with resolvable type hints.
+        mapping: plain YAML values; nested dataclasses are nested mappings.
+        where: dotted place, for messages.
+        also: keys that the caller has read already, for the hint at an unknown one.
+
+    Raises:
+        InputError: an unknown key (naming the nearest), a missing one, a wrong type, or a value that the
+            dataclass itself refuses.
+    """
+    if not isinstance(mapping, Mapping):
+        raise InputError(f"{where}: expected a mapping of keys, got {mapping!r}")
+    try:
+        hints = _type_hints(cls)
+    except Exception as error:  # whatever the names of a third party's types lead to
+        raise InputError(f"{where}: a type of {cls.__name__}'s fields cannot be resolved: {error}") from error
+    settings = settings_of(cls)
+    for key in mapping:
+        if key not in settings:
+            raise InputError(f"unknown key '{where}.{key}': {nearest(key, [*settings, *also])}")
+    for name, field in settings.items():
+        if name not in mapping and field.default is MISSING and field.default_factory is MISSING:
+            raise InputError(f"{where}: key '{name}' is missing")
+    values = {key: convert(value, hints[key], f"{where}.{key}") for key, value in mapping.items()}
+    try:
+        return cls(**values)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{where}: {error}") from error
+
+
+_type_hints: Callable[[Any], dict[str, Any]] = cache(
+    typing.get_type_hints
+)  # each call evaluates every annotation of the class again
+
+
+def dataclass_mapping(instance: Any) -> dict[str, Any]:
+    """The settings of a dataclass as plain YAML values: the inverse of `build_dataclass`."""
+    return {name: _plain(getattr(instance, name)) for name in settings_of(type(instance))}
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        return dataclass_mapping(value)
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return value
+
+
+def convert(value: Any, hint: Any, where: str) -> Any:
+    """`value` as the type that a hint asks for.
+
+    A whole number becomes a float where one is asked for, and ``5e3`` an integer; nothing else changes its type. A hint
+    that is no YAML type is not checked here: the dataclass checks such a field itself.
+
+    Raises:
+        InputError: `value` is of another type.
+    """
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if is_dataclass(hint) and isinstance(hint, type):
+        return build_dataclass(hint, value, where)
+    if origin in UNIONS:
+        for argument in arguments:
+            with suppress(InputError):
+                return convert(value, argument, where)
+    elif origin is list or (origin is tuple and arguments[-1] is Ellipsis):
+        if isinstance(value, tuple | list):
+            return origin(convert(item, arguments[0], f"{where}[{place}]") for place, item in enumerate(value))
+    elif origin is tuple:
+        if isinstance(value, tuple | list) and len(value) == len(arguments):
+            return tuple(convert(item, kind, where) for item, kind in zip(value, arguments, strict=True))
+    elif origin is dict:
+        if isinstance(value, Mapping):
+            return {_key(key, where): convert(item, arguments[1], f"{where}.{key}") for key, item in value.items()}
+    elif hint is float:
+        if number and not math.isnan(value):
+            return float(value)
+    elif hint is int:
+        if number and math.isfinite(value) and value == int(value):
+            return int(value)
+    elif origin is Literal:
+        if value in arguments:
+            return value
+    elif hint not in NAMES or isinstance(value, hint):
+        return value
+    raise InputError(f"{where}: expected {_named(hint)}, got {value!r}")
+
+
+def _key(key: Any, where: str) -> str:
+    if not isinstance(key, str):
+        raise InputError(f"{where}: the name {key!r} is not text: put it in quotes, '{key}'")
+    return key
+
+
+def _named(hint: Any) -> str:
+    """What values of a type are called in messages."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in UNIONS:
+        return " or ".join(map(_named, arguments))
+    if origin is Literal:
+        return " or ".join(map(str, arguments))
+    if origin in (tuple, list):
+        return "a list, as [A, B]" if Ellipsis in arguments or origin is list else f"a list of {len(arguments)} values"
+    return NAMES.get(hint, "a mapping of keys")
