@@ -31,6 +31,7 @@ import torch
 from PIL import Image
 
 from turbogs_plugin.bench.step import StepBench
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.device import free_device_memory
 from turbogs_plugin.files import write_text_atomically
@@ -38,7 +39,7 @@ from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.reconstruct import reconstruct
 from turbogs_plugin.report.provenance import provenance
-from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.study.cell import WARMUP_ITERATIONS, scene_on, warm_up
 from turbogs_plugin.train.evaluate import evaluate

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from gsplat_host import Options, command_line, report, train
 from sparse_pixels import SparseForward
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_budget
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
 
 def main(options: Options) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 import tyro
 from torch import Tensor
-from turbogs_plugin.strategies.losses import CharbonnierNccLoss
-from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.gsplat_bridge import gather_pixels
+from turbogs_plugin.strategies.losses import CharbonnierNccLoss
+from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler
 from turbogs_plugin.types import PixelSamples, Step
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from gsplat import DefaultStrategy
 from gsplat_host import Options, command_line, l1_of_images_with_errors, report, train
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
-from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
 
 def main(options: Options) -> None:

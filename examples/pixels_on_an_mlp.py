@@ -13,13 +13,13 @@ import tyro
 from image_fitting import ImageNetwork, places_of
 from PIL import Image, ImageDraw
 from torch import Tensor
-from turbogs_plugin.strategies import PixelSampler, SparseLoss
-from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
-from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.gsplat_bridge import gather_pixels
 from turbogs_plugin.report.provenance import provenance
+from turbogs_plugin.strategies import PixelSampler, SparseLoss
+from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
+from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 from turbogs_plugin.types import PixelSamples, Step
 
 

@@ -8,11 +8,11 @@ import torch
 from gsplat import DefaultStrategy
 from gsplat_host import Batch, Options, command_line, render_arguments, report, train
 from torch import Tensor
-from turbogs_plugin.strategies.losses import CharbonnierNccLoss
-from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.gsplat_bridge import gather_pixels, maps_of_photos, sparse_budget, sparse_loss, sparse_rasterization
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.strategies.losses import CharbonnierNccLoss
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.types import Step
 
 

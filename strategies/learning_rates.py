@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from turbogs_plugin.strategies.checks import require_settings
-
 from turbogs_plugin.engine.rules import ParameterRates
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.types import PARAMETER_NAMES, Step
 
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from torch import Tensor
-from turbogs_plugin.strategies.checks import require_positive, require_settings
 
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.rules import STRUCTURE_CONSTANT, LossTerms
 from turbogs_plugin.errors import require
+from turbogs_plugin.strategies.checks import require_positive, require_settings
 from turbogs_plugin.types import LossOutput, PixelSamples
 
 

@@ -18,9 +18,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from turbogs_plugin.strategies.checks import require_at_least_one, require_positive, require_settings
-
 from turbogs_plugin.errors import require
+from turbogs_plugin.strategies.checks import require_at_least_one, require_positive, require_settings
 from turbogs_plugin.types import SamplingBudget, Step
 
 EPSILON = 1e-12

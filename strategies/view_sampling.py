@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from turbogs_plugin.strategies.checks import require_settings
 
 from turbogs_plugin.engine.reference.philox import PURPOSE_STACK, PURPOSE_VIEWS, host_words
 from turbogs_plugin.errors import require
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.types import Cameras, Step
 
 

@@ -11,8 +11,8 @@ import torch
 
 import turbogs_plugin
 from turbogs_plugin import strategies
+from turbogs_plugin.captures import write_demo_capture
 from turbogs_plugin.config import registry
-from turbogs_plugin.scene import write_demo_capture
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "architecture.md"

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
 
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import PixelSamples, Step
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 from helpers.sampling_cases import SIZES, UNITS, pixels_by_tile, random_maps, step
-from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks
+from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 from turbogs_plugin.tiles import compact, dense_pixels, pixel_table
 from turbogs_plugin.types import TILE_SIZE, PixelSamples
 

@@ -19,7 +19,6 @@ from turbogs_plugin.errors import InputError, exit_code
 COMMANDS = {
     "train": training.train,
     "reconstruct": captures.reconstruct,
-    "refine": captures.refine,
     "plan": training.plan,
     "view": models.view,
     "eval": models.evaluate,

@@ -16,7 +16,7 @@ from turbogs_plugin.train.evaluate import LPIPS_PACKAGES
 from turbogs_plugin.train.flip import load_flip
 from turbogs_plugin.viewer.page import INSTALL as INSTALL_VIEWER
 
-REQUIREMENTS = ("pycolmap>=4.0", "omegaconf>=2.3", "tyro>=0.9", "rich>=13.0", "matplotlib>=3.8")
+REQUIREMENTS = ("pycolmap>=4.0", "scipy>=1.14", "omegaconf>=2.3", "tyro>=0.9", "rich>=13.0", "matplotlib>=3.8")
 """The extra ``train`` of pyproject.toml. The strategies and the gsplat bridge need none of it."""
 COMMAND_PACKAGES = {requirement.partition(">=")[0]: requirement for requirement in REQUIREMENTS}
 """Module -> requirement."""

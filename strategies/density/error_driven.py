@@ -9,12 +9,12 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
+
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_settings, require_share
 from turbogs_plugin.strategies.density.priority import drawn_by_squares, squares_of
 from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, keep_one, removal
 from turbogs_plugin.strategies.density.splitting import split_in_two
-
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 EPS = 1e-12

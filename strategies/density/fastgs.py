@@ -7,11 +7,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
+
 from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, require_share, shared_settings
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.rows import add_stats, finite_rows, leave_one, loaded_rows, removal, saved_rows
 from turbogs_plugin.strategies.protocols import DensityController
-
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 

@@ -10,10 +10,10 @@ import torch
 from gsplat.strategy import DefaultStrategy, Strategy
 from gsplat.strategy.ops import reset_opa
 from torch import Tensor
-from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, shared_settings
-from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 
 from turbogs_plugin.errors import require
+from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, shared_settings
+from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 

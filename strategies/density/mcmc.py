@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 import torch
 from gsplat.strategy import MCMCStrategy
 from torch import Tensor
+
+from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.strategies.checks import require_at_least_one, require_settings, shared_settings
 from turbogs_plugin.strategies.density.gsplat_default import new_rows, run_gsplat
 from turbogs_plugin.strategies.density.rows import finite_rows
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.protocols import DensityController
-
-from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 DEAD_LOGIT = -50.0

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.protocols import DensityController
-
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 

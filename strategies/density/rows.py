@@ -6,9 +6,9 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-from turbogs_plugin.strategies.protocols import DensityController
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.protocols import DensityController
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate
 
 RowsType = TypeVar("RowsType")  # a dataclass of [N] tensors

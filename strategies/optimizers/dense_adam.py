@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.optim.adam import adam
-from turbogs_plugin.strategies.checks import require_settings
-from turbogs_plugin.strategies.learning_rates import LearningRates
 
 from turbogs_plugin.engine.moments import check_moments_config, check_state
 from turbogs_plugin.engine.reference.update import clipped, finite_gradients
+from turbogs_plugin.strategies.checks import require_settings
+from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, RowUpdate, Step
 
 

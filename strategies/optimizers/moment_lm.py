@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from turbogs_plugin.engine.rules import MomentLMParams
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
-
-from turbogs_plugin.engine.rules import MomentLMParams
 
 
 @dataclass

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from torch import Tensor
-from turbogs_plugin.strategies.learning_rates import LearningRates
 
 from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
 from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.rules import MomentLMParams, UpdateRule
+from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.types import GaussianGradients, Gaussians, RowUpdate, Step
 
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from turbogs_plugin.strategies.protocols import DensityController
 
 from turbogs_plugin.config import registry
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.protocols import DensityController
 
 ALL_TYPES = [(kind, name) for kind, types_of_kind in registry.BUILT_IN.items() for name in types_of_kind]
 

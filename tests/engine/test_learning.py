@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import LossOutput, Step
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
-from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 
 from turbogs_plugin.engine.reference.philox import exponentials
 from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
+from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 from turbogs_plugin.types import Step
 
 pytestmark = [

@@ -6,9 +6,6 @@ import numpy as np
 import pytest
 import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians
-from turbogs_plugin.strategies.learning_rates import LearningRates
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
-from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
 from turbogs_plugin.distributed.peer_memory import aligned_starts
 from turbogs_plugin.engine.cuda import launches
@@ -21,6 +18,9 @@ from turbogs_plugin.engine.reference.projection import drawable_rows, project_ro
 from turbogs_plugin.engine.reference.raster import ReferenceScreenGradients
 from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.learning_rates import LearningRates
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 from turbogs_plugin.types import (
     PARAMETER_NAMES,
     GaussianGradients,

@@ -13,10 +13,6 @@ from helpers.bridge_host import HEIGHT, WIDTH, Host, arguments, make_cameras, ma
 from helpers.gsplat_stand_ins import CAMERAS, COUNT, rendered_info, stand_in, stock_info
 from torch import distributed
 from torch.testing._internal.distributed.fake_pg import FakeStore
-from turbogs_plugin.strategies.losses import CharbonnierNccLoss
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
-from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
-from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
@@ -29,6 +25,10 @@ from turbogs_plugin.gsplat_bridge import (
     sparse_rasterization,
 )
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, loss_shares
+from turbogs_plugin.strategies.losses import CharbonnierNccLoss
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
+from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
 from turbogs_plugin.types import Step
 
 DROP_IN = Path(__file__).resolve().parents[2] / "docs" / "drop-in.md"

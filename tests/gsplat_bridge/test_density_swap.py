@@ -11,8 +11,6 @@ from gsplat import DefaultStrategy, MCMCStrategy
 from helpers.bridge_host import SURGERY, Host, assert_rows_match_after, make_splats, surgery
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
@@ -20,6 +18,8 @@ from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, 
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 from turbogs_plugin.gsplat_bridge.tuned import GATES
 from turbogs_plugin.model.row_order import in_order_of_space
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, RowUpdate, Step
 
 SOON = {"refine_start_iter": 2, "refine_every": 3, "refine_stop_iter": 5, "grow_grad2d": 1e-6}

@@ -12,12 +12,12 @@ from gsplat import DefaultStrategy
 from helpers.bridge_host import RATES, SURGERY, Host, assert_rows_match_after, make_splats, surgery
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
-from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
+from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 from turbogs_plugin.types import PARAMETER_NAMES
 
 RULES = {"adam": SparseAdam, "lm": MomentLMOptimizer}

@@ -8,8 +8,6 @@ import pytest
 import torch
 from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats
 from helpers.gsplat_torch import gsplat_torch_render
-from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
-from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.rendering import dense_samples
@@ -17,6 +15,8 @@ from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_loss, sparse_rasterization
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, screen_statistics
+from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
+from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, Step
 
 GSPLAT_KEYS = {

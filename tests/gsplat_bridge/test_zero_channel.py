@@ -5,11 +5,11 @@ import pytest
 import torch
 from helpers.bridge_host import make_splats
 from helpers.gsplat_stand_ins import CAMERAS, COUNT, rendered_info, stand_in, stock_info
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, loss_shares
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
 
 @pytest.fixture

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 from helpers.optimizers import fill, make_gaussians
-from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 SQUARES = {

@@ -7,13 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from torch import Tensor
-from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.types import PixelSamples, Step
 
 Made = Callable[[np.ndarray], np.ndarray]

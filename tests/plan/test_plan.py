@@ -8,6 +8,7 @@ import pytest
 import torch
 from helpers.framework_runs import TINY, stop_after, tiny_config
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.auto import AUTO_SETTINGS
 from turbogs_plugin.config.configuration import apply_overrides, config_names, load_config, resolve
 from turbogs_plugin.config.old_spellings import NOW, old_spelling
@@ -17,7 +18,6 @@ from turbogs_plugin.plan import Plan, SceneFacts
 from turbogs_plugin.plan.decisions import RULES
 from turbogs_plugin.plan.plan import plan_from_facts
 from turbogs_plugin.report.pages import write_report
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer

@@ -12,11 +12,11 @@ import pytest
 from helpers.refusals import assert_refused
 from PIL import Image
 
+from turbogs_plugin.captures import write_demo_capture
 from turbogs_plugin.reconstruct import Solution, reconstruct, run, solver
 from turbogs_plugin.reconstruct.effort import DOUBLED
 from turbogs_plugin.reconstruct.photos import read_photos
 from turbogs_plugin.reconstruct.workspace import Workspace
-from turbogs_plugin.scene import write_demo_capture
 
 HOLD = "import fcntl, sys; file = open(sys.argv[1], 'r+b'); fcntl.flock(file, 2); print(flush=True); input()"
 

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import assert_identical, tiny_config
-from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.report import outputs
-from turbogs_plugin.scene import Scene, load_scene, offload
+from turbogs_plugin.scene import Scene, offload
 from turbogs_plugin.scene.offload import ABSENT, OffloadedErrorMaps, OffloadedPhotos, ViewWindow
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Step

@@ -15,11 +15,11 @@ from gsplat.strategy import ops
 from helpers.optimizers import all_finite, clone, equal, fill, make_gaussians, random_stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from turbogs_plugin.strategies.density.fastgs import FastGsDensity
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
 from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 from turbogs_plugin.strategies.learning_rates import LearningRates
-
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, Step
 
 EVENT = Step(iteration=600, total=5000, refine_until=3500, seed=7, scene_extent=1.0)

@@ -7,8 +7,8 @@ import torch
 from helpers.optimizers import all_finite, make_gaussians
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.types import Step
 
 EVENT = Step(iteration=200, total=5000, refine_until=3500, seed=7, scene_extent=1.0)

@@ -19,10 +19,11 @@ from helpers.framework_runs import tiny_config
 from helpers.models import random_gaussians
 from PIL import Image
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.gsplat_file import save_gsplat
 from turbogs_plugin.model.ply import save_ply
-from turbogs_plugin.scene import Frame, Scene, load_scene
+from turbogs_plugin.scene import Frame, Scene
 from turbogs_plugin.train import given_model
 from turbogs_plugin.train.initial_state import initial_gaussians
 from turbogs_plugin.types import Gaussians

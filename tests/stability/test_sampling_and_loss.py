@@ -4,10 +4,10 @@ import numpy as np
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from turbogs_plugin.strategies.losses import CharbonnierNccLoss, SparseSsimLoss
-from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
+from turbogs_plugin.strategies.losses import CharbonnierNccLoss, SparseSsimLoss
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.types import PixelSamples, Step
 
 ANY_ERROR = st.sampled_from([0.0, 6e-8, 1e-3, 0.3, 3.0, 65504.0, 1e30, float("inf"), float("-inf"), float("nan")])

@@ -9,9 +9,9 @@ import pytest
 import torch
 from helpers.optimizers import all_finite
 from helpers.squares import EVENT, SQUARES, event, event_at, grown, removed, small_model, spread_squares, window
+
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity, _decayed
 from turbogs_plugin.strategies.density.priority import TINY, drawn_by_squares
-
 from turbogs_plugin.types import GaussianStats, Step
 
 COUNT = 40

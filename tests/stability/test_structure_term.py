@@ -12,6 +12,7 @@ from helpers.stiff_tiles import (
     toward_the_photo,
 )
 from helpers.tolerances import STRUCTURE_BOUND
+
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 
 

@@ -16,10 +16,10 @@ from helpers.optimizers import (
     make_gaussians,
     make_gradients,
 )
-from turbogs_plugin.strategies.learning_rates import LearningRates
-from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.learning_rates import LearningRates
+from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam
 from turbogs_plugin.types import PARAMETER_NAMES, RowUpdate, Step
 
 RATES = LearningRates(batch_scale=1.0)

@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 from helpers.optimizers import busy_stats, fill, make_gaussians, random_stats
+
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.priority import drawn_by_squares, squares_of
-
 from turbogs_plugin.types import GaussianStats, Step
 
 COUNT = 40

@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 from helpers.optimizers import clone, make_gaussians
-from turbogs_plugin.strategies.density.rows import finite_rows, keep_one, leave_one
 
+from turbogs_plugin.strategies.density.rows import finite_rows, keep_one, leave_one
 from turbogs_plugin.types import PARAMETER_NAMES
 
 

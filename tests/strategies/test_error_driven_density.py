@@ -10,13 +10,13 @@ import torch
 from helpers.optimizers import STEP, all_finite, busy_stats, fill, make_gaussians, make_gradients, random_stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.fastgs import FastGsDensity
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
 from turbogs_plugin.strategies.density.none import NoDensity
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
-
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import GaussianStats, Step
 
 FULL = Step(1200, 3500, 3500, seed=3, scene_extent=2.0)  # past `prune_size_from`; no final pruning follows

@@ -3,10 +3,10 @@
 import pytest
 import torch
 from helpers.bridge_host import make_splats
-from turbogs_plugin.strategies.density.fastgs import FastGsDensity
-from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.density.fastgs import FastGsDensity
+from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 from turbogs_plugin.types import Gaussians, Step
 
 COUNT = 8

@@ -10,9 +10,9 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 from helpers.optimizers import make_gaussians
-from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
 from turbogs_plugin.types import RowUpdate, Step
 
 COUNT, VIEWS, SIZE = 80, 3, (64, 48)

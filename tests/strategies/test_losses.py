@@ -5,12 +5,12 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 
 from turbogs_plugin.engine.reference.tile_groups import TileGroups
 from turbogs_plugin.engine.reference.window_similarity import window_similarity
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.tiles import pixel_table
 from turbogs_plugin.train.ssim import ssim
 from turbogs_plugin.types import PixelSamples

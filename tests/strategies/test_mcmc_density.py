@@ -5,10 +5,10 @@ import pytest
 import torch
 from gsplat.strategy import MCMCStrategy, ops
 from helpers.optimizers import make_gaussians
-from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.types import Step
 
 COUNT, ADDED = 100, 5

@@ -10,11 +10,11 @@ import torch
 from helpers.optimizers import STEP, all_finite, clone, equal, make_gaussians, make_gradients, scaled
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
-
-from turbogs_plugin.errors import InputError
 
 NAMES = ("means", "scales", "quats", "sh0", "opacities")
 WIDTHS = (3, 3, 4, 3, 1)

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 from helpers.sampling_cases import SIGMAS, SIZES, UNITS, pixels_by_tile, random_maps, step
-from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
-from turbogs_plugin.strategies.schedule import SinusoidalSchedule
-from turbogs_plugin.strategies.view_sampling import RandomViewSampler
 
 from turbogs_plugin.engine.reference.draws import DrawRule
 from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, exponentials, random_words
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
+from turbogs_plugin.strategies.schedule import SinusoidalSchedule
+from turbogs_plugin.strategies.view_sampling import RandomViewSampler
 from turbogs_plugin.types import TILE_SIZE, Cameras, sample_order
 
 # --- layout ---------------------------------------------------------------------------------------------------------

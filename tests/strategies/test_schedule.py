@@ -4,14 +4,14 @@ import itertools
 import math
 
 import pytest
+
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.schedule import (
     ExponentialSchedule,
     FixedSchedule,
     LinearSchedule,
     SinusoidalSchedule,
 )
-
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Step
 
 ADAPTIVE = [SinusoidalSchedule, LinearSchedule, ExponentialSchedule]

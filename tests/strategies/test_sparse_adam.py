@@ -15,12 +15,12 @@ from helpers.optimizers import (
     make_gaussians,
     make_gradients,
 )
+
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
-
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, RowUpdate, Step
 
 OPTIMIZERS = [SparseAdam, MomentLMOptimizer]

@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from turbogs_plugin.strategies.view_sampling import GeometryAwareViewSampler, RandomViewSampler
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.view_sampling import GeometryAwareViewSampler, RandomViewSampler
 from turbogs_plugin.types import Cameras, Step
 
 SAMPLERS = [GeometryAwareViewSampler, RandomViewSampler]

@@ -19,13 +19,13 @@ from helpers.refusals import assert_refused
 from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin import cli
+from turbogs_plugin.captures import load_scene, write_demo_capture
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan.decisions import RULES, Verdict
 from turbogs_plugin.report import provenance as provenance_module
 from turbogs_plugin.report.provenance import provenance
-from turbogs_plugin.scene import load_scene, write_demo_capture
 from turbogs_plugin.study import cell as cell_module
 from turbogs_plugin.study import sweep
 from turbogs_plugin.study.cell import capture_digest, train_cell

@@ -9,8 +9,8 @@ import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_config
 from helpers.simulated_time import SimulatedTime
-from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed.exchange import Exchange
 from turbogs_plugin.distributed.peer_memory import PeerMemory
@@ -20,7 +20,8 @@ from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.plan.pixels import TOLERANCE, pixel_budget_range, pixels_for_time, with_pixel_budget
 from turbogs_plugin.plan.time import IterationCost
 from turbogs_plugin.report.pages import write_report
-from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.train import calibration, run
 
 CPU = torch.device("cpu")

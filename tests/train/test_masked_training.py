@@ -9,17 +9,17 @@ import pytest
 import torch
 from helpers.framework_runs import assert_identical, tiny_capture, tiny_config
 from PIL import Image
-from turbogs_plugin.strategies.losses import CharbonnierLoss
-from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.rendering import rasterize, render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.outputs import evaluate_run
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.report.pictures import MASKED, strip
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.strategies.losses import CharbonnierLoss
+from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler
 from turbogs_plugin.tiles import compact, pixel_table
 from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.evaluate import Look, compare, evaluate, render_view

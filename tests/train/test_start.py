@@ -60,7 +60,7 @@ def test_a_limit_of_memory_is_compared_with_the_sizes_of_photos(capture, monkeyp
     def decoded(*_):
         raise AssertionError("photos are decoded")
 
-    monkeypatch.setattr("turbogs_plugin.scene.load.load_photos", decoded)
+    monkeypatch.setattr("turbogs_plugin.captures.load.load_photos", decoded)
     config = tiny_config(capture, f"budget.max_memory={limit}")
     with pytest.raises(InputError if words else AssertionError, match=words or "photos are decoded"):
         start.open_scene(config, training=True)

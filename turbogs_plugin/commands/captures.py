@@ -1,4 +1,4 @@
-"""`turbogs reconstruct`, `turbogs refine` and `turbogs demo`, which write captures to train on."""
+"""`turbogs reconstruct` and `turbogs demo`, which write captures to train on."""
 
 from __future__ import annotations
 
@@ -21,29 +21,13 @@ def reconstruct(photos: Annotated[Positional[Path], arg(metavar="PHOTOS")], /, *
     return 0
 
 
-def refine(scene: Annotated[Positional[Path], arg(metavar="SCENE")], /, *, out: Path) -> int:
-    """Give each photo of a COLMAP capture a refined camera of its own, and write a capture to train on.
-
-    Any trainer will do that reads the principal point of each camera: gsplat's does, LiteGS and 3DGS's own do not.
-
-    Args:
-        scene: folder of a capture with sparse/0 (COLMAP) and photos without distortion.
-        out: new folder for the capture, with sparse/0 and links to the photos.
-    """
-    from turbogs_plugin.export.refined_capture import write_refined
-
-    print(write_refined(scene, out))
-    return 0
-
-
-def demo(path: Positional[Path], /, horizon: bool = False) -> int:
+def demo(path: Positional[Path], /) -> int:
     """Write a small synthetic capture to try things on: a textured scene as a COLMAP dataset.
 
     Args:
         path: new folder.
-        horizon: a scene outdoors, seen as far as the sky.
     """
-    from turbogs_plugin.scene import write_demo_capture
+    from turbogs_plugin.captures import write_demo_capture
 
-    print(f"capture  {write_demo_capture(path, horizon=horizon)}")
+    print(f"capture  {write_demo_capture(path)}")
     return 0

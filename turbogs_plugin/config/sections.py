@@ -63,8 +63,8 @@ class TrainConfig:
         sh_degree: highest degree of the spherical harmonics.
         sh_interval: iterations between two bands; the run starts with band 0, but for a model's file.
         refine_cameras: train with cameras that agree better with the points that photos show: each photo has a pose,
-            focal lengths and a principal point of its own (`turbogs_plugin.scene.camera_refinement`). Nothing where the
-            capture does not say which photos show a point, as COLMAP does. Test photos keep their cameras.
+            focal lengths and a principal point of its own (`captures.camera_refinement`). Nothing where the capture
+            does not say which photos show a point, as COLMAP does. Test photos keep their cameras.
         initial_opacity, initial_size: of the Gaussians that training starts with; the size in mean distances to the
             three nearest points. 3DGS has 0.1 and 1, gsplat's MCMC preset 0.5 and 0.1.
         background: colour that shows through the model: ``black``, ``white``, another that Pillow knows, as

@@ -1,6 +1,6 @@
 """A COLMAP capture whose photos each have a refined camera of their own, for any trainer that reads principal points.
 
-Cameras and points are refined by `turbogs_plugin.scene.bundle_adjustment`, here from all photos: a trainer that takes
+Cameras and points are refined by `captures.bundle_adjustment`, here from all photos: a trainer that takes
 some of them for testing tests with refined cameras, too. One that takes the middle of each photo for its principal
 point (3DGS's own, LiteGS) would see the photos shifted, some by many pixels.
 """
@@ -20,9 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import require_writable
-from turbogs_plugin.scene.bundle_adjustment import (
+from turbogs_plugin.captures.bundle_adjustment import (
     FARTHEST_MATCH,
     Pinholes,
     Refinement,
@@ -30,12 +28,14 @@ from turbogs_plugin.scene.bundle_adjustment import (
     of_these_photos,
     refine_together,
 )
-from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, named
-from turbogs_plugin.scene.colmap import REDUCED, incomplete_model, load_pycolmap, read_colmap, read_reconstruction
-from turbogs_plugin.scene.colmap_check import write_whole
-from turbogs_plugin.scene.load import camera_files
-from turbogs_plugin.scene.mask_files import FOLDER as MASKS
-from turbogs_plugin.scene.nearby import capture_near
+from turbogs_plugin.captures.capture import LARGEST_SIDE, Capture, named
+from turbogs_plugin.captures.colmap import REDUCED, incomplete_model, load_pycolmap, read_colmap, read_reconstruction
+from turbogs_plugin.captures.colmap_check import write_whole
+from turbogs_plugin.captures.load import camera_files
+from turbogs_plugin.captures.mask_files import FOLDER as MASKS
+from turbogs_plugin.captures.nearby import capture_near
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import require_writable
 
 if TYPE_CHECKING:
     import pycolmap

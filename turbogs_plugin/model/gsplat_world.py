@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from turbogs_plugin.model.similarity import Similarity
-from turbogs_plugin.scene.poses import camera_centers
+from turbogs_plugin.scene.geometry import camera_centers
 
 HALF_TURNS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
 

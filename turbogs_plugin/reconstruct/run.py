@@ -11,6 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, named
+from turbogs_plugin.captures.colmap import load_pycolmap
+from turbogs_plugin.captures.mask_files import misnamed
+from turbogs_plugin.captures.photo_folder import find_photos, unread
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct import solver
 from turbogs_plugin.reconstruct.agreement import (
@@ -26,10 +30,6 @@ from turbogs_plugin.reconstruct.masks import find_photo_masks, place_masks
 from turbogs_plugin.reconstruct.matching import FEW, Matching, choose_matching
 from turbogs_plugin.reconstruct.photos import PhotoFile, place_photos, read_photos
 from turbogs_plugin.reconstruct.workspace import Solution, Workspace
-from turbogs_plugin.scene.capture import FEWEST_PHOTOS, named
-from turbogs_plugin.scene.colmap import load_pycolmap
-from turbogs_plugin.scene.mask_files import misnamed
-from turbogs_plugin.scene.photo_folder import find_photos, unread
 
 if TYPE_CHECKING:
     import pycolmap

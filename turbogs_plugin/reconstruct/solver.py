@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct.agreement import Agreement
 from turbogs_plugin.reconstruct.effort import Effort
 from turbogs_plugin.reconstruct.matching import Matching
 from turbogs_plugin.reconstruct.photos import PhotoFile
 from turbogs_plugin.reconstruct.watch import row_counter, watched
-from turbogs_plugin.scene.colmap import load_pycolmap
 
 if TYPE_CHECKING:
     import pycolmap

@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from turbogs_plugin.captures.decoding import photo_sizes, reduced_sizes
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.reconstruct.photos import list_photos
 from turbogs_plugin.reconstruct.run import reconstruct, scene_beside
-from turbogs_plugin.scene.photos import photo_sizes, reduced_sizes
 
 
 def reconstruct_beside(config: Config, run: Path) -> Path:

@@ -37,7 +37,7 @@ def watched(
     Raises:
         KeyboardInterrupt: after the step has stopped; what it had finished is kept.
     """
-    from turbogs_plugin.scene.colmap import load_pycolmap
+    from turbogs_plugin.captures.colmap import load_pycolmap
 
     token = load_pycolmap().CancellationToken()
     outcome: Future[Result] = Future()

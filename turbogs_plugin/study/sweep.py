@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+from turbogs_plugin.captures.camera_refinement import load_and_find, with_cameras
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.old_spellings import old_spelling
 from turbogs_plugin.device import free_device_memory, synchronize
@@ -20,7 +21,6 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.report.tensorboard import EventWriter, event_writers
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.camera_refinement import load_and_find, with_cameras
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.claims import Claims
 from turbogs_plugin.study.difference import ABSENT, compared, difference

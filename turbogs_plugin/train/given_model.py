@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.captures.fingerprint import frame_of_state
 from turbogs_plugin.engine.rendering import DEFAULT_SETTINGS, render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
@@ -26,8 +27,7 @@ from turbogs_plugin.model.gsplat_world import gsplat_worlds
 from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.model.torch_file import read_plain
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.fingerprint import frame_of_state
-from turbogs_plugin.scene.poses import evenly
+from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.train.background import Background
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.evaluate import psnr

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import torch
 
+from turbogs_plugin.captures.camera_refinement import refine_cameras
+from turbogs_plugin.captures.load import holds_photos_alone
 from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, resolve
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine.layout import MAX_VIEWS
@@ -19,8 +21,6 @@ from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.plan import Plan, make_plan
 from turbogs_plugin.plan.pixels import most_views
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.camera_refinement import refine_cameras
-from turbogs_plugin.scene.load import holds_photos_alone
 from turbogs_plugin.train.calibration import Calibration, budget_text, hold_to, within_budget
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.evaluate import load_lpips

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from turbogs_plugin.captures.camera_refinement import load_and_find, with_cameras
 from turbogs_plugin.config.auto import AUTO
 from turbogs_plugin.config.configuration import Config, resolve
 from turbogs_plugin.device import synchronize
@@ -22,7 +23,6 @@ from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.camera_refinement import load_and_find, with_cameras
 from turbogs_plugin.train.folder import RunFolder
 from turbogs_plugin.train.given_model import read_given
 from turbogs_plugin.train.progress import LoadingProgress

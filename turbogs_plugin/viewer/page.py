@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.poses import evenly
+from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.types import Cameras
 from turbogs_plugin.viewer.controls import Controls
 from turbogs_plugin.viewer.eye import Eye

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import require
+from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler
 from turbogs_plugin.types import PixelSamples, Step
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from turbogs_plugin.strategies.protocols import DensityController
 
 from turbogs_plugin.errors import require
+from turbogs_plugin.strategies.protocols import DensityController
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 
