@@ -229,7 +229,7 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
     ],
 )
 def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch, error, remedy):
-    def refused(path, horizon):
+    def refused(path):
         raise error
 
     monkeypatch.setattr(captures, "write_demo_capture", refused)

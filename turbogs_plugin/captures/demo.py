@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from turbogs_plugin.captures.colmap import load_pycolmap
-from turbogs_plugin.captures.colmap_check import write_whole
+from turbogs_plugin.captures.colmap import load_pycolmap, write_whole
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import look_at
 

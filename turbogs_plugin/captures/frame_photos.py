@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, named
-from turbogs_plugin.captures.colmap import FOLDER_DEPTH, OTHER_IMAGES
+from turbogs_plugin.captures.photo_files import FOLDER_DEPTH, OTHER_IMAGES
 from turbogs_plugin.captures.photo_folder import NO_PHOTOS, PHOTO_SUFFIXES
 from turbogs_plugin.errors import InputError
 

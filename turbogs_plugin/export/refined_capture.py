@@ -29,11 +29,17 @@ from turbogs_plugin.captures.bundle_adjustment import (
     refine_together,
 )
 from turbogs_plugin.captures.capture import LARGEST_SIDE, Capture, named
-from turbogs_plugin.captures.colmap import REDUCED, incomplete_model, load_pycolmap, read_colmap, read_reconstruction
-from turbogs_plugin.captures.colmap_check import write_whole
+from turbogs_plugin.captures.colmap import (
+    incomplete_model,
+    load_pycolmap,
+    read_colmap,
+    read_reconstruction,
+    write_whole,
+)
 from turbogs_plugin.captures.load import camera_files
 from turbogs_plugin.captures.mask_files import FOLDER as MASKS
 from turbogs_plugin.captures.nearby import capture_near
+from turbogs_plugin.captures.photo_files import REDUCED
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from turbogs_plugin.captures.colmap_check import write_whole
+from turbogs_plugin.captures.colmap import write_whole
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable, write_text_atomically
 from turbogs_plugin.reconstruct.effort import Effort
