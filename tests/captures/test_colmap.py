@@ -12,7 +12,7 @@ import torch
 from helpers.refusals import assert_refused
 from PIL import ExifTags, Image
 
-from turbogs_plugin.captures import colmap, load_scene
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import find_model, read_colmap
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PixelSamples

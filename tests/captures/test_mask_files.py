@@ -246,7 +246,7 @@ def test_transforms_name_masks(capture, tmp_path):
     [
         ("absent.png", r"names the mask .*absent.png, which is not there: bring it back"),
         (7, "mask_path of frame .* is not a path: write one"),
-        ("../../secret.png", "leaves the photo folder"),
+        ("../../secret.png", "secret.png, which is not there"),
     ],
 )
 def test_transforms_with_a_bad_mask_path_are_refused(capture, tmp_path, path, words):

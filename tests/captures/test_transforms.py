@@ -254,16 +254,15 @@ def set_pose(value):
         (lambda content: content.update(frames=content["frames"][:2]), "has 2 images"),
         (lambda content: content["frames"].append(content["frames"][0]), "two frames for 'images/f0.png': take"),
         (lambda content: content["frames"][0].pop("file_path"), "a frame without a file_path"),
-        (lambda content: content["frames"][0].update(file_path="/"), "leaves the photo folder"),
         (
             lambda content: [frame.update(file_path=f"/home/me/none{i}") for i, frame in enumerate(content["frames"])],
-            r"names 9 photos, of which 9 are missing in .*/cup/me \(/home/me/none0, ...\): at least 3",
+            r"names 9 photos, of which 9 are missing in .*/cup \(/home/me/none0, ...\): at least 3",
         ),
         (
             lambda content: [frame.update(file_path=f"none{i}.png") for i, frame in enumerate(content["frames"][2:])],
             r"names 9 photos, of which 7 are missing in .* \(none0.png, ...\): at least 3",
         ),
-        (lambda content: content.update(ply_file_path="../points.ply"), "leaves the photo folder"),
+        (lambda content: content.update(ply_file_path="../points.ply"), "points.ply is not there: bring it back"),
         (lambda content: content.update(ply_file_path=3), "ply_file_path is not a path: write one, or take it out"),
         (lambda content: content.update(ply_file_path="points.ply"), "points.ply is not there: bring it back, or take"),
         (set_pose(None), "f2.png' has no transform_matrix"),
@@ -361,7 +360,9 @@ def test_an_absent_photo_of_another_machine_is_left_out_like_any(tmp_path, writt
     edit(folder, change)
     scene = load_scene(folder)
     assert (*scene.test.names, *scene.train.names) == ("f0.png", *(f"f{view}.png" for view in (1, 2, 3, 4, 6, 8)))
-    assert scene.notes[1] == f"2 of 9 frames are left out, their photos do not exist: {written.format(5)}, ..."
+    assert scene.notes[1] == f"2 of 9 frames are left out, their photos do not exist: {written.format(5)}, ...".replace(
+        "\\", "/"
+    )
 
 
 @pytest.mark.parametrize("written", ["images/f{}.jpeg", "/home/me/cup/images/f{}.JPG", "images\\f{}.tif"])
@@ -407,7 +408,7 @@ def test_photos_in_another_folder_that_may_be_others_are_not_taken(tmp_path):
     (folder / "images").rename(folder / "old")
     (folder / "rgb").mkdir()
     (folder / "rgb/f2.png").write_bytes((folder / "old/f2.png").read_bytes())
-    missing = r"names 9 photos, of which 9 are missing in .*/cup/images \(images/f0.png, ...\): at least 3 are needed; "
+    missing = r"names 9 photos, of which 9 are missing in .*/cup \(images/f0.png, ...\): at least 3 are needed; "
     assert_refused(missing + r"copy the photos there \(f2.png is in .*/cup/old, .*/cup/rgb\)$", load_scene, folder)
     (folder / "rgb/f2.png").unlink()
     edit(folder, lambda content: content["frames"][1].update(file_path="other/f0.png"))

@@ -109,6 +109,20 @@ def left_out(absent: Sequence[str], count: int, called: str) -> str:
     return f"{len(absent)} of {count} {called} are left out, their photos do not exist: {absent[0]}, ..."
 
 
+def require_enough(scene: Path, source: Path, absent: Sequence[str], count: int, unclear: str = "") -> None:
+    """Raise `InputError` where photos of a file's `count` frames do not exist and fewer than `FEWEST_PHOTOS` remain.
+
+    Args:
+        absent: names of the photos that do not exist.
+        unclear: why they were not found elsewhere.
+    """
+    if absent and count - len(absent) < FEWEST_PHOTOS:
+        raise InputError(
+            f"{source} names {count} photos, of which {len(absent)} are missing in {scene} ({absent[0]}, ...): at "
+            f"least {FEWEST_PHOTOS} are needed; copy the photos there{unclear}"
+        )
+
+
 def check_photo_name(name: str, source: Path) -> str:
     """The name, with slashes where a Windows machine wrote backslashes, if it can be printed and stays within the photo
     folder; else `InputError`."""

@@ -14,8 +14,8 @@ import numpy as np
 
 from turbogs_plugin.captures.capture import Capture, check_photo_name, sizes_text
 from turbogs_plugin.captures.decoding import photo_sizes
+from turbogs_plugin.captures.photo_files import FRAME_SUFFIXES
 from turbogs_plugin.captures.starting_points import NUM_RANDOM_POINTS, points_in_views
-from turbogs_plugin.captures.transforms import PHOTO_SUFFIXES
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import viewmat_of_pose
 
@@ -114,7 +114,7 @@ def _usable_folders(scene: Path, factor: int) -> list[tuple[int, list[Path]]]:
     found = ((int(match[1] or 1), _photos_of(path)) for path, match in matches if match and path.is_dir())
     folders = sorted((folder for folder in found if folder[1]), key=lambda folder: -folder[0])
     if not folders:
-        raise InputError(f"{scene} has {FILE} but no photos ({', '.join(PHOTO_SUFFIXES)}): put them into images")
+        raise InputError(f"{scene} has {FILE} but no photos ({', '.join(FRAME_SUFFIXES)}): put them into images")
     usable = [folder for folder in folders if factor % folder[0] == 0]
     if not usable and factor == 1:
         usable = folders[-1:]
@@ -128,7 +128,7 @@ def _usable_folders(scene: Path, factor: int) -> list[tuple[int, list[Path]]]:
 
 
 def _photos_of(folder: Path) -> list[Path]:
-    files = (file for file in sorted(folder.iterdir()) if file.suffix.lower() in PHOTO_SUFFIXES)
+    files = (file for file in sorted(folder.iterdir()) if file.suffix.lower() in FRAME_SUFFIXES)
     return [file for file in files if not file.name.startswith(".") and file.is_file()]
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from turbogs_plugin.captures.camera_json import number_of, opengl_viewmat, pinhole, read_frames
 from turbogs_plugin.captures.capture import LARGEST_SIDE
-from turbogs_plugin.captures.transforms import number_of, opengl_viewmat, pinhole, read_frames
 from turbogs_plugin.engine.reference.projection import rotation_matrices
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.frame import Frame
