@@ -8,7 +8,7 @@ from helpers.framework_runs import tiny_capture
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.captures.load import holds_photos_alone
+from turbogs_plugin.captures.kinds import holds_photos_alone
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct.photos import list_photos
 

@@ -12,7 +12,7 @@ from PIL import Image
 
 from turbogs_plugin.captures import load_scene, undistort
 from turbogs_plugin.captures.colmap import read_colmap
-from turbogs_plugin.captures.undistort import brown_projection, lens_of_camera, make_lens
+from turbogs_plugin.captures.undistort import brown_projection, lens_of_camera
 
 pytestmark = pytest.mark.usefixtures("few_random_points")
 
@@ -238,8 +238,6 @@ def test_a_fourth_radial_coefficient_is_a_power_as_in_nerfstudio():
     expected = brown(points, stretch, 0.003, -0.002) * [260.0, 270.0] + [163.0, 117.0]
     project = brown_projection((260.0, 270.0), (163.0, 117.0), (0.1, -0.05, 0.02, 0.4), 0.003, -0.002)
     np.testing.assert_allclose(project(points), expected, rtol=1e-12)
-    lens = make_lens("OPENCV", (WIDTH, HEIGHT), project, "a camera")
-    assert min(lens.size) > 200
 
 
 def test_a_fourth_radial_coefficient_is_read(tmp_path):
@@ -259,14 +257,9 @@ def test_no_pixel_is_without_a_source_and_little_is_lost(model):
     sources = bent.img_from_cam(np.concatenate([rays, np.ones((len(rays), 1))], axis=1))
     assert np.isfinite(sources).all()
     assert sources.min() > 0 and (sources < [WIDTH, HEIGHT]).all()
-    # At least two sides end at the rim of the photo: otherwise the rectangle could grow.
-    rims = [*sources.min(axis=0), *([WIDTH, HEIGHT] - sources.max(axis=0))]
-    assert sum(distance < 2 for distance in rims) >= 2
-    # COLMAP's own choice has no more pixels at the same focal length.
     options = pycolmap.UndistortCameraOptions(blank_pixels=0.0)
     theirs = pycolmap.undistort_camera(options, bent)
-    focal = lens.K[0, 0] * lens.K[1, 1] / (theirs.focal_length_x * theirs.focal_length_y)
-    assert width * height >= 0.99 * focal * theirs.width * theirs.height
+    assert (theirs.width, theirs.height) == lens.size
 
 
 def test_a_lens_that_folds_back_is_used_as_far_as_it_goes():
@@ -279,41 +272,7 @@ def test_a_lens_that_folds_back_is_used_as_far_as_it_goes():
 def test_a_wide_fisheye_keeps_to_60_degrees_off_the_axis():
     lens = lens_of_camera(camera("OPENCV_FISHEYE", [100.0, 100.0, 160.0, 120.0, 0.0, 0.0, 0.0, 0.0]), "a camera")
     extent = np.array(lens.size) / lens.K[[0, 1], [0, 1]] / 2
-    np.testing.assert_allclose(extent, np.tan(np.pi / 3), atol=0.01)
-
-
-def every_candidate(start, end, inside, upright):
-    """The search of `make_lens` with both tests of all rectangles in all rounds."""
-    for _ in range(undistort.ROUNDS):
-        rectangles = start + np.linspace(0.0, 1.0, undistort.CANDIDATES)[1:, None] * (end - start)
-        ok = inside(rectangles) & upright(rectangles)
-        if ok.all():
-            return end
-        first = int(np.argmin(ok))
-        start, end = (rectangles[first - 1] if first else start), rectangles[first]
-    return start
-
-
-@pytest.mark.parametrize("model", [*PARAMS, "folds"])
-def test_a_lens_is_found_by_few_projections(monkeypatch, model):
-    folds = ("SIMPLE_RADIAL", [190.0, 160.0, 120.0, -0.4])
-    bent = camera(*(folds if model == "folds" else (model, PARAMS[model])))
-    points = 0
-
-    def project(at):
-        nonlocal points
-        points += len(at)
-        return bent.img_from_cam(np.concatenate([at, np.ones((len(at), 1))], axis=1))
-
-    lens = make_lens(model, (WIDTH, HEIGHT), project, "a camera")
-    few, points = points, 0
-    monkeypatch.setattr(undistort, "_furthest", every_candidate)
-    same = make_lens(model, (WIDTH, HEIGHT), project, "a camera")
-    assert lens.size == same.size
-    np.testing.assert_allclose(lens.K, same.K, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(lens.sources, same.sources, rtol=0, atol=1e-9)
-    lattice = undistort.LATTICE**2
-    assert model == "folds" or few - lattice < (points - lattice) / 3
+    assert (extent < np.tan(np.pi / 3) + 0.01).all() and extent.max() > 1.5  # of 173 degrees at the photo's rim
 
 
 def test_cameras_with_equal_numbers_have_one_lens(tmp_path):
@@ -362,8 +321,7 @@ def test_photos_smaller_than_their_camera_are_undistorted(tmp_path):
 
 def test_undistorted_colors_are_rounded_to_the_nearest():
     photo = np.random.default_rng(0).integers(100, 104, (HEIGHT, WIDTH, 3)).astype(np.uint8)
-    project = brown_projection((260.0, 260.0), (163.0, 117.0), (-0.1,), 0.0, 0.0)
-    lens = make_lens("RADIAL", (WIDTH, HEIGHT), project, "a camera")
+    lens = lens_of_camera(camera("RADIAL", [260.0, 163.0, 117.0, -0.1, 0.0]), "a camera")
     assert lens.undistort(photo, lens.size).mean() == pytest.approx(photo.mean(), abs=0.05)
 
 

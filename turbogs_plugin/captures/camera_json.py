@@ -13,7 +13,7 @@ import numpy as np
 from turbogs_plugin.captures.capture import LARGEST_SIDE
 from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.captures.decoding import photo_size
-from turbogs_plugin.captures.undistort import Lens, brown_projection, lens_of_camera, make_lens
+from turbogs_plugin.captures.undistort import Lens, brown_projection, lens_of_camera
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import viewmat_of_pose
 
@@ -84,19 +84,17 @@ def read_camera(
 
 def _make_lens(fisheye: bool, size: tuple[int, int], K: np.ndarray, bends: tuple[float, ...], owner: str) -> Lens:
     """`bends`: k1, k2, k3, k4, p1, p2."""
-    radial, (k1, k2, k3, k4, p1, p2) = bends[:4], bends
+    k1, k2, k3, k4, p1, p2 = bends
     pinhole = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    if not fisheye and k4:
-        # As nerfstudio has it: COLMAP's models, and OpenCV's own fourth coefficient, are other polynomials.
-        return make_lens("OPENCV", size, brown_projection(pinhole[:2], pinhole[2:], radial, p1, p2), owner)
+    model, params = "OPENCV", [*pinhole, k1, k2, p1, p2]
     if fisheye:
-        model, params = "OPENCV_FISHEYE", [*pinhole, *radial]
-    elif k3:
+        model, params = "OPENCV_FISHEYE", [*pinhole, *bends[:4]]
+    elif k3 or k4:
         model, params = "FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
-    else:
-        model, params = "OPENCV", [*pinhole, k1, k2, p1, p2]
     camera = load_pycolmap().Camera(model=model, width=size[0], height=size[1], params=params)
-    return lens_of_camera(camera, owner)
+    # As nerfstudio has it: COLMAP's models, and OpenCV's own fourth coefficient, are other polynomials.
+    fourth = None if fisheye or not k4 else brown_projection(pinhole[:2], pinhole[2:], bends[:4], p1, p2)
+    return lens_of_camera(camera, owner, fourth)
 
 
 def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tuple[int, int]]:

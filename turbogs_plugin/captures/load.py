@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-import shlex
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Lock
@@ -15,9 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.captures import blender, llff
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, named
-from turbogs_plugin.captures.colmap import INSTANT_NGP_FOLDERS, MODEL_FOLDERS, find_model, incomplete_model, read_colmap
 from turbogs_plugin.captures.decoding import (
     channels_of,
     is_turned,
@@ -26,11 +23,9 @@ from turbogs_plugin.captures.decoding import (
     photo_sizes,
     reduced_sizes,
 )
+from turbogs_plugin.captures.kinds import capture_around, read_capture
 from turbogs_plugin.captures.mask_files import find_masks, load_masks
-from turbogs_plugin.captures.nearby import POSE_FILES, capture_around, capture_near
-from turbogs_plugin.captures.photo_folder import find_photos, unread
 from turbogs_plugin.captures.starting_points import colors_in_photos
-from turbogs_plugin.captures.transforms import FILE, read_transforms
 from turbogs_plugin.captures.undistort import undistortion_note
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks, ViewMask
@@ -41,11 +36,27 @@ from turbogs_plugin.scene.scene import PosedImages, PosedViews, Scene
 from turbogs_plugin.types import Cameras
 
 MOST_PIXELS = 1 << 28
-"""Of a photo as it is trained on. Where tiles are drawn whole, a draw tells 2^20 of a view apart (`RANK_BITS` of
+"""Pixels of a photo as it is trained on. Where tiles are drawn whole, a draw tells 2^20 of a view apart (`RANK_BITS` of
 engine/reference/draws.py)."""
-
 FARTHEST = 1e15
 """Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
+
+
+@dataclass(frozen=True)
+class PhotoFiles:
+    """The files that V photos are read from.
+
+    Args:
+        paths: V files.
+        file_sizes: [V, 2] int64 (width, height) that they have.
+        sizes: [V, 2] int64 (width, height) to give them, undistorted and reduced.
+        note: on photos of another size than their cameras; empty where there is none.
+    """
+
+    paths: list[Path]
+    file_sizes: np.ndarray
+    sizes: np.ndarray
+    note: str = ""
 
 
 def load_scene(
@@ -79,48 +90,16 @@ def load_scene(
         InputError: anything wrong with the scene or the arguments, in one line.
     """
     scene = Path(path)
-    if not isinstance(factor, int) or factor < 1:
-        raise InputError(f"factor is {factor}: it must be an integer of at least 1")
-    if not isinstance(test_every, int) or test_every < 1:
-        raise InputError(f"test_every is {test_every}: it must be an integer of at least 1")
+    for name, number in (("factor", factor), ("test_every", test_every)):
+        if not isinstance(number, int) or number < 1:
+            raise InputError(f"{name} is {number}: it must be an integer of at least 1")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
-        capture = _read(scene, factor)
-    test = np.arange(len(capture.names)) % test_every == 0 if capture.test is None else capture.test
-    if len(test) < FEWEST_PHOTOS:
-        raise InputError(f"{scene} has {len(test)} images: at least {FEWEST_PHOTOS} are needed; add photos to it")
-    if capture.test is not None and (~test).sum() < FEWEST_PHOTOS:
-        raise InputError(f"{scene} has {(~test).sum()} training images: at least {FEWEST_PHOTOS} are needed; add some")
-    if test.all():
-        raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
-
-    with np.errstate(over="ignore", invalid="ignore"):
-        frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
-    viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats)).float()
-    points = torch.from_numpy(frame.normalise_points(capture.points)).float()
-    far = ~(points.abs() < FARTHEST).all(dim=1)
-    if far.any():
-        raise InputError(
-            f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32: take them out"
-        )
-    if factor > 1 and factor % capture.reduction:
-        raise InputError(
-            f"--factor {factor}: the largest photos of {scene} are those of {capture.photo_folder.name}: use --factor "
-            f"{capture.reduction} or a multiple of it, or bring the full-size photos back"
-        )
-    remaining = max(1, factor // capture.reduction)
-    paths, file_sizes, sizes, fitted = _find_photos(scene, capture, remaining)
-    largest = sizes[np.argmax(sizes.prod(axis=1))]
-    if largest.prod() > MOST_PIXELS:
-        raise InputError(
-            f"{scene}: a photo would have {largest[0]}x{largest[1]} pixels, more than {MOST_PIXELS}: use --factor "
-            f"{factor * math.ceil(math.sqrt(largest.prod() / MOST_PIXELS))}"
-        )
-    ratios = sizes / capture.sizes  # [V, 2]
-    intrinsics = capture.Ks.copy()
-    intrinsics[:, :2] *= ratios[:, :, None]
-
-    mask_files, mask_note = find_masks(scene, capture, paths)
-    masks = load_masks(mask_files, paths, capture, file_sizes, sizes)
+        capture = read_capture(scene, factor)
+    test = _test_views(scene, capture, test_every)
+    frame, viewmats, points = _normalised(scene, capture, test)
+    files = _find_photos(scene, capture, factor)
+    mask_files, mask_note = find_masks(scene, capture, files.paths)
+    masks = load_masks(mask_files, files.paths, capture, files.file_sizes, files.sizes)
     seen = np.array([mask is None or mask.pixels > 0 for mask in masks])
     for name, part in (("training", ~test), ("test", test)):
         if not (part & seen).any():
@@ -128,13 +107,12 @@ def load_scene(
                 f"{scene}: all {part.sum()} {name} photos are masked whole: zero in a mask, or in "
                 "the alpha of a photo, is masked; mend the masks, or take them away"
             )
-
     parts = [np.flatnonzero(part & seen) for part in (~test, test)]
-    channels = [channels_of([paths[view] for view in views]) if capture.alpha == "opacity" else 3 for views in parts]
+    posed = [_posed(capture, viewmats, files.sizes, views) for views in parts]
     # Before minutes go into photos that have no room.
     if sized is not None:
-        sized(*(sizes[views] for views in parts))
-    colors = [photo_array(sizes[views], count) for views, count in zip(parts, channels, strict=True)]
+        sized(*(files.sizes[views] for views in parts))
+    colors = [_room(capture, files, views) for views in parts]
     counter, one_at_a_time = itertools.count(1), Lock()
 
     def loaded() -> None:
@@ -142,30 +120,20 @@ def load_scene(
             if progress is not None:
                 progress(next(counter), int(seen.sum()))
 
-    def pose(views: np.ndarray) -> PosedViews:
-        cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
-        shown = None if capture.observations is None else capture.observations.of_views(views, ratios[views])
-        return PosedViews(cameras, shown)
-
-    def select(views: np.ndarray, colors: Tensor, posed: PosedViews, meanwhile: Callable | None) -> PosedImages:
-        names = tuple(capture.names[view] for view in views)
-        files, lenses = ([of_view[view] for view in views] for of_view in (paths, capture.lenses))
-        photos = load_photos(files, file_sizes[views], sizes[views], lenses, colors, loaded, meanwhile)
-        masked = _pixel_masks([masks[view] for view in views], sizes[views])
-        return PosedImages(posed.cameras, names, photos, masked, posed.observations)
-
-    posed = [pose(views) for views in parts]
-    work = (None if meanwhile is None else partial(meanwhile, *posed, points), None)
-    train, tested = (select(*part) for part in zip(parts, colors, posed, work, strict=True))
+    works = (None if meanwhile is None else partial(meanwhile, *posed, points), None)
+    train, tested = (
+        _load_views(capture, files, views, masks, posed_views, room, loaded, work)
+        for views, posed_views, room, work in zip(parts, posed, colors, works, strict=True)
+    )
     if capture.point_colors is None:
         point_colors = colors_in_photos(points, train.cameras, train.photos, train.masks)
     else:
         point_colors = torch.from_numpy(capture.point_colors)
     notes = (
-        fitted,
+        files.note,
         undistortion_note(capture.lenses),
         mask_note,
-        _masked_note(capture.names, masks, mask_files, sizes, seen),
+        _masked_note(capture.names, masks, mask_files, files.sizes, seen),
         "transparent photos are composited on a background (train.background)" if train.photos.transparent else "",
         file_note([train.photos.stored, tested.photos.stored], "photos"),
     )
@@ -180,6 +148,67 @@ def load_scene(
         drawn_points=capture.point_colors is None,
         notes=tuple(filter(None, (*capture.notes, *notes))),
     )
+
+
+def _test_views(scene: Path, capture: Capture, test_every: int) -> np.ndarray:
+    """[V] bool: the test views, by the capture's own split or by order; enough views remain to train on."""
+    views = len(capture.names)
+    test = np.arange(views) % test_every == 0 if capture.test is None else capture.test
+    if views < FEWEST_PHOTOS:
+        raise InputError(f"{scene} has {views} images: at least {FEWEST_PHOTOS} are needed; add photos to it")
+    if capture.test is not None and (~test).sum() < FEWEST_PHOTOS:
+        raise InputError(f"{scene} has {(~test).sum()} training images: at least {FEWEST_PHOTOS} are needed; add some")
+    if test.all():
+        raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
+    return test
+
+
+def _normalised(scene: Path, capture: Capture, test: np.ndarray) -> tuple[Frame, Tensor, Tensor]:
+    """The normalised frame about the training cameras; in it, float32 poses [V, 4, 4] and points [M, 3]."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
+    viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats)).float()
+    points = torch.from_numpy(frame.normalise_points(capture.points)).float()
+    far = ~(points.abs() < FARTHEST).all(dim=1)
+    if far.any():
+        raise InputError(
+            f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32: take them out"
+        )
+    return frame, viewmats, points
+
+
+def _posed(capture: Capture, viewmats: Tensor, sizes: np.ndarray, views: np.ndarray) -> PosedViews:
+    """Some views' cameras for photos of these `sizes` [V, 2], and what the photos show."""
+    ratios = sizes / capture.sizes  # [V, 2]
+    intrinsics = capture.Ks.copy()
+    intrinsics[:, :2] *= ratios[:, :, None]
+    cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
+    shown = None if capture.observations is None else capture.observations.of_views(views, ratios[views])
+    return PosedViews(cameras, shown)
+
+
+def _room(capture: Capture, files: PhotoFiles, views: np.ndarray) -> Tensor:
+    """Room for the photos of some views, with alpha where that is opacity."""
+    channels = channels_of([files.paths[view] for view in views]) if capture.alpha == "opacity" else 3
+    return photo_array(files.sizes[views], channels)
+
+
+def _load_views(
+    capture: Capture,
+    files: PhotoFiles,
+    views: np.ndarray,
+    masks: list[ViewMask | None],
+    posed: PosedViews,
+    colors: Tensor,
+    loaded: Callable[[], object],
+    meanwhile: Callable[[], object] | None,
+) -> PosedImages:
+    """Some views with their photos, decoded into `colors`; the last two arguments are for `load_photos`."""
+    paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
+    photos = load_photos(paths, files.file_sizes[views], files.sizes[views], lenses, colors, loaded, meanwhile)
+    masked = _pixel_masks([masks[view] for view in views], files.sizes[views])
+    names = tuple(capture.names[view] for view in views)
+    return PosedImages(posed.cameras, names, photos, masked, posed.observations)
 
 
 def _pixel_masks(masks: list[ViewMask | None], sizes: np.ndarray) -> PixelMasks | None:
@@ -209,116 +238,40 @@ def _masked_note(
     return f"{len(cut)} photos have masked pixels{by}, {share:.1%} of them{left_out}"
 
 
-def holds_photos_alone(scene: Path) -> bool:
-    """Whether a folder has photos, and nothing that says where they were taken from: no reconstruction in parts, and no
-    capture in it or around it."""
-    if not scene.is_dir() or _is_begun(scene) or camera_files(scene) != (None, []):
-        return False
-    return bool(find_photos(scene)[1]) and not capture_near(scene)
-
-
-def _is_begun(scene: Path) -> bool:
-    """Whether there is a folder for a reconstruction, whatever it has."""
-    return any((scene / place.partition("/")[0]).is_dir() for place in MODEL_FOLDERS if place != ".")
-
-
-def camera_files(scene: Path) -> tuple[tuple[Path, str] | None, list[str]]:
-    """What a folder has of cameras: the reconstruction, as `find_model` gives it, and the names of other files."""
-    files = [file for file in POSE_FILES if (scene / file).is_file()]
-    return find_model(scene, anywhere=not files), files
-
-
-def _read(scene: Path, factor: int) -> Capture:
-    """The capture, of the first kind in the order that `load_scene` states."""
-    if not scene.is_dir():
-        if scene.is_file() and not unread(scene) and (where := capture_around(scene)):
-            raise InputError(where)
-        trouble = f"{scene} is a file" if scene.is_file() else f"{scene} does not exist"
-        raise InputError(f"no such scene: {unread(scene) or f'{trouble}: give the folder of a capture, or of photos'}")
-    model, files = camera_files(scene)
-    found = _read_model(scene, model, files)
-    if isinstance(found, Capture):
-        return found
-    other = _read_other(scene, files, factor)
-    return replace(other, notes=(*other.notes, found)) if found else other
-
-
-def _read_model(scene: Path, model: tuple[Path, str] | None, files: list[str]) -> Capture | str:
-    """The capture of what `camera_files` gave, or why that reconstruction is not used; empty where there is none."""
-    if model is None:
-        lack = incomplete_model(scene)
-        if lack is None or lack[0] == scene:
-            return ""
-        return f"{lack[0]} is not used: it has no {' and no '.join(lack[1])}"
-    # What instant-ngp leaves beside its transforms.json must serve as well as that.
-    whole = bool(files) and model[0].relative_to(scene).parts[:1] in [(name,) for name in INSTANT_NGP_FOLDERS]
-    try:
-        capture = read_colmap(scene, *model)
-    except InputError as error:
-        if not whole:
-            raise
-        return f"{model[0]} is not used: {error}"
-    there = [(capture.photo_folder / name).is_file() for name in capture.names]
-    if not files or (all(there) if whole else any(there)):
-        return _passing_over(files, capture)
-    # LLFF's poses are of the reduced copies too, which have other names than COLMAP's photos.
-    return f"{model[0]} not used, its photos are not there"
-
-
-def _read_other(scene: Path, files: list[str], factor: int) -> Capture:
-    """The capture of the first of these files, none of them COLMAP's."""
-    if FILE in files:
-        return _passing_over(files[1:], read_transforms(scene))
-    if files and files[0] in blender.FILES:
-        return _passing_over([file for file in files if file not in blender.FILES], blender.read_blender(scene))
-    if files:
-        return llff.read_llff(scene, factor)
-    if not _is_begun(scene) and (where := capture_near(scene)):
-        raise InputError(where)
-    solve = f"'turbogs reconstruct {shlex.quote(str(scene))} --out SCENE'"
-    if holds_photos_alone(scene):
+def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
+    """The files to read where photos are to be reduced by `factor`: copies in ``images_<factor>`` where all are there
+    in the right size, else the full-size photos."""
+    if factor > 1 and factor % capture.reduction:
         raise InputError(
-            f"{scene} has {len(find_photos(scene)[1])} photos and nothing that says where they were taken from: find "
-            f"that by {solve}, then use SCENE"
+            f"--factor {factor}: the largest photos of {scene} are those of {capture.photo_folder.name}: use --factor "
+            f"{capture.reduction} or a multiple of it, or bring the full-size photos back"
         )
-    if lack := incomplete_model(scene):
-        folder, absent = lack
-        files_back = "bring that file" if len(absent) == 1 else "bring these files"
-        anew = f"take {scene / folder.relative_to(scene).parts[0]} away and find the cameras" if folder != scene else ""
+    remaining = max(1, factor // capture.reduction)
+    files = _reduced_copies(scene, capture, remaining) or _full_photos(scene, capture, remaining)
+    largest = files.sizes[np.argmax(files.sizes.prod(axis=1))]
+    if largest.prod() > MOST_PIXELS:
         raise InputError(
-            f"{folder} has no {' and no '.join(absent)}: {files_back} of the reconstruction back"
-            + (f", or {anew} by {solve}" if anew and find_photos(scene)[1] else "")
+            f"{scene}: a photo would have {largest[0]}x{largest[1]} pixels, more than {MOST_PIXELS}: use --factor "
+            f"{factor * math.ceil(math.sqrt(largest.prod() / MOST_PIXELS))}"
         )
-    if photos := find_photos(scene)[1]:
-        begun = next(place for place in MODEL_FOLDERS if (scene / place).is_dir())
-        raise InputError(
-            f"{scene} has {len(photos)} photos and no reconstruction in {scene / begun}: bring its files back, or take "
-            f"the folder away and find the cameras by {solve}"
-        )
-    raise InputError(
-        f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
-        f"{FILE}, a {blender.TRAIN_FILE} or a {llff.FILE}, nor photos"
-        + f"; {unread(scene) or 'give the folder of a capture, or of photos'}"
-    )
+    return files
 
 
-def _passing_over(files: list[str], capture: Capture) -> Capture:
-    """The capture, whose notes say that these files, which make the folder another kind too, were not used."""
-    return replace(capture, notes=(*capture.notes, f"{', '.join(files)} not used")) if files else capture
+def _reduced_copies(scene: Path, capture: Capture, factor: int) -> PhotoFiles | None:
+    if factor == 1:
+        return None
+    reduced_sizes(capture.sizes, factor)  # refuses a factor that is too large
+    folder = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
+    paths = [folder / name for name in capture.names]
+    if capture.photo_folder == scene or not all(path.is_file() for path in paths):
+        return None
+    sizes = photo_sizes(paths)
+    if (np.abs(sizes - capture.photo_sizes / factor) > 1.0).any():
+        return None
+    return PhotoFiles(paths, sizes, _undistorted_sizes(capture, sizes))
 
 
-def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path], np.ndarray, np.ndarray, str]:
-    """The files to read, [V, 2] their sizes, [V, 2] the sizes to give them, and a note on those of other sizes."""
-    if factor > 1:
-        reduced_sizes(capture.sizes, factor)  # refuses a factor that is too large
-    expected = capture.photo_sizes
-    if factor > 1 and capture.photo_folder != scene:
-        folder = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
-        paths = [folder / name for name in capture.names]
-        if all(path.is_file() for path in paths):
-            sizes = photo_sizes(paths)
-            if (np.abs(sizes - expected / factor) <= 1.0).all():
-                return paths, sizes, _undistorted_sizes(capture, sizes), ""
+def _full_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
     paths = [capture.photo_folder / name for name in capture.names]
     missing = [name for name, path in zip(capture.names, paths, strict=True) if not path.is_file()]
     if len(missing) == len(paths) and (where := capture_around(scene)):
@@ -329,8 +282,8 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path]
             f"{len(missing)} of {len(paths)} photos are missing in {capture.photo_folder}: {named(missing)}; {remedy}"
         )
     sizes = photo_sizes(paths)
-    fitted = _require_scaled(paths, sizes, expected)
-    return paths, sizes, reduced_sizes(_undistorted_sizes(capture, sizes), factor), fitted
+    note = _require_scaled(paths, sizes, capture.photo_sizes)
+    return PhotoFiles(paths, sizes, reduced_sizes(_undistorted_sizes(capture, sizes), factor), note)
 
 
 def _in_other_letters(path: Path) -> str:
