@@ -2,19 +2,16 @@
 
 import json
 import math
-import random
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.bounded_memory import outcome_within
 from helpers.painted import painted_photo, require_points_at_their_pixels
 from helpers.refusals import assert_refused
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene, write_demo_capture
-from turbogs_plugin.errors import InputError
 
 SIZE, ANGLE = (60, 40), 0.7
 POINTS = np.array([[0.3, 0.0, 0.1], [-0.2, 0.25, -0.3], [0.0, -0.4, 0.35]])
@@ -169,24 +166,6 @@ def test_photos_with_another_suffix(tmp_path):
     )
 
 
-def test_photos_of_other_sizes_have_the_same_angle_of_view(tmp_path):
-    folder = write_blender(tmp_path / "lego")
-    Image.new("RGBA", (120, 80)).save(folder / "train/r_1.png")
-    scene = load_scene(folder)
-    focal = 60 / math.tan(0.5 * ANGLE)
-    np.testing.assert_allclose(scene.train.cameras.Ks[1], [[focal, 0, 60], [0, focal, 40], [0, 0, 1]], rtol=1e-6)
-    assert "photos 60x40 to 120x80, RGBA" in scene.notes[0]
-
-
-def test_points_are_seeded_and_about_the_object(tmp_path):
-    folder = write_blender(tmp_path / "lego")
-    scene, again = load_scene(folder), load_scene(folder)
-    assert scene.points.equal(again.points) and np.array_equal(scene.point_colors, again.point_colors)
-    points = scene.frame.restore_points(scene.points.numpy())
-    assert (points.min(axis=0) < POINTS.min(axis=0)).all() and (points.max(axis=0) > POINTS.max(axis=0)).all()
-    assert np.abs(points.mean(axis=0)).max() < 0.05 and np.abs(points).max() < 2.1
-
-
 def test_which_kind_is_taken_of_several(tmp_path):
     """COLMAP, transforms.json, NeRF-synthetic, LLFF, in this order; what is passed over is named."""
     folder = write_blender(tmp_path / "all", {"train": 6, "val": 3, "test": 4})
@@ -203,11 +182,6 @@ def test_which_kind_is_taken_of_several(tmp_path):
         shutil.copytree(demo / part, folder / part)
     scene = load_scene(folder)
     assert scene.notes[1] == f"transforms.json, {passed_over}" and scene.train.cameras.sizes[0].tolist() == [32, 24]
-
-
-def test_what_the_folder_was_taken_for_is_said(turbogs, tmp_path):
-    code, _, said = turbogs("plan", write_blender(tmp_path / "lego"), "--device", "cpu")
-    assert code == 0 and "(NeRF-synthetic): 6 training and 4 test photos 60x40, RGBA;" in said.splitlines()[0]
 
 
 def frame(**values):
@@ -244,27 +218,3 @@ def test_what_is_refused(tmp_path, change, words):
     folder = write_blender(tmp_path / "lego")
     edit(folder, change)
     assert_refused(words, load_scene, folder)
-
-
-def test_without_its_training_file(tmp_path):
-    folder = write_blender(tmp_path / "lego")
-    (folder / "transforms_train.json").unlink()
-    with pytest.raises(InputError, match=r"has no transforms_train\.json"):
-        load_scene(folder)
-
-
-@pytest.mark.usefixtures("few_random_points")
-def test_damaged_files(tmp_path):
-    """Bytes changed or cut: refused in one line, or a scene of finite numbers."""
-    folder = write_blender(tmp_path / "lego")
-    content, choice, refused = (folder / "transforms_train.json").read_bytes(), random.Random(0), 0
-    for _ in range(150):
-        data = bytearray(content)
-        for _ in range(choice.choice([1, 2, 8])):
-            data[choice.randrange(len(data))] = choice.randrange(256)
-        (folder / "transforms_train.json").write_bytes(data[: choice.choice([None, None, choice.randrange(len(data))])])
-        result = outcome_within(2**25, load_scene, folder)
-        refused += isinstance(result, InputError)
-        if not isinstance(result, InputError):
-            assert result.train.cameras.viewmats.isfinite().all() and result.points.isfinite().all()
-    assert 75 < refused < 150

@@ -16,8 +16,6 @@ from turbogs_plugin.distributed.ranks import Ranks
 from turbogs_plugin.engine.rendered import RasterSettings
 from turbogs_plugin.model.initial import gaussians_from_points
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.study.cell import capture_digest
-from turbogs_plugin.study.folder import StudyFolder
 from turbogs_plugin.train.evaluate import Look, evaluate
 from turbogs_plugin.train.start import read_scene
 
@@ -58,11 +56,6 @@ def test_pixels_are_those_of_undistorted_photos(tmp_path):
     scene = load_scene(folder)
     assert scene.train.cameras.sizes[0].tolist() != [WIDTH, HEIGHT]
     assert median_error(scene, "train") < 3.0, "as without the lens"
-
-
-def test_pixels_are_those_of_reduced_photos(capture):
-    whole, half = load_scene(capture), load_scene(capture, factor=2)
-    np.testing.assert_allclose(half.train.observations.pixels, 0.5 * whole.train.observations.pixels)
 
 
 @pytest.mark.parametrize("factor", [1, 2])
@@ -138,28 +131,6 @@ def test_errors_by_refined_test_cameras_stand_beside_the_others(capture):
     moved = evaluate(gaussians, replace(scene.test, cameras=scene.test.refined), look).mean
     assert mean.refined_psnr == moved.psnr != mean.psnr
     assert np.isnan(evaluate(gaussians, scene.test, look).mean.refined_psnr)
-
-
-def test_cells_with_and_without_it_are_of_one_capture(turbogs, capture, tmp_path):
-    """In one study; both have errors by refined test cameras at their end, and nowhere else."""
-    ablation = tmp_path / "both.yaml"
-    ablation.write_text("title: Both\nbase: turbogs\nvariants: {own: [], given: [train.refine_cameras=false]}\n")
-    settings = ("scene.factor=8", "train.sh_degree=0", "schedule.max_views=3", "train.backdrop=false")
-    arguments = ("--scene", capture, "--out", tmp_path / "study", "--device", "cpu", "--steps", 3)
-    code, _, err = turbogs("ablate", ablation, *settings, *arguments)
-    assert code == 0, err
-    own, given = StudyFolder(tmp_path / "study").read_study().results
-    assert own.capture == given.capture == capture_digest(load_scene(capture, factor=8))
-    assert own.history[0].psnr != given.history[0].psnr, "points moved"
-    for cell in (own, given):
-        *before, last = cell.history
-        assert np.isfinite(last.refined_psnr) and all(np.isnan(entry.refined_psnr) for entry in before)
-    own, given = own.history[-1], given.history[-1]
-    page = (tmp_path / "study/report.md").read_text()
-    _, said = page.split("### By refined test cameras on cup")
-    row = next(line for line in said.splitlines() if line.startswith("| given |"))
-    difference = given.refined_psnr - own.refined_psnr
-    assert row.split(" | ")[1:3] == [f"{given.refined_psnr:.2f}", f"{difference:+.2f}"]
 
 
 def test_a_resumed_run_has_the_same_cameras(turbogs, capture, tmp_path):

@@ -4,7 +4,6 @@ Each shows painted points, so that photos, intrinsics and poses must belong toge
 """
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -190,27 +189,6 @@ def test_convert_py_of_gaussian_splatting(tmp_path, size, kept):
         assert (f", photos in {expected}" in scene.notes[0]) == (expected != folder / "images")
 
 
-@pytest.mark.parametrize("size", [(240, 160), (210, 137)])
-def test_convert_py_where_a_photo_was_taken_away(tmp_path, size):
-    """Of input it is not taken where the cameras are of the undistorted photos' size."""
-    camera, root = [pinhole(*size, 200.0)], tmp_path / "bonsai"
-    write_model(root / "sparse/0", camera, NAMES)
-    write_photos(root / "input", [pinhole(240, 160, 200.0)], NAMES)
-    write_photos(root / "images", [pinhole(210, 137, 200.0)], NAMES)
-    (root / "images" / NAMES[0]).unlink()
-    scene = load_scene(root)
-    assert len(scene.train) + len(scene.test) == (9 if size == (240, 160) else 8)
-    assert scene.train.cameras.sizes[0].tolist() == list(size)
-
-
-def test_masks_of_the_cameras_size_are_no_photos(tmp_path):
-    camera = [pinhole(240, 160, 200.0)]
-    write_model(tmp_path / "scan24/sparse/0", camera, NAMES)
-    write_photos(tmp_path / "scan24/images", camera, NAMES, 2)
-    write_photos(tmp_path / "scan24/mask", camera, NAMES)
-    assert load_scene(tmp_path / "scan24").train.cameras.sizes[0].tolist() == [120, 80]
-
-
 @pytest.mark.parametrize(("model", "suffix"), [("colmap_sparse/0", ".bin"), ("colmap_text", ".txt")])
 def test_instant_ngp(tmp_path, model, suffix):
     """transforms.json without points, and COLMAP's model in folders of colmap2nerf.py's names."""
@@ -264,29 +242,6 @@ def test_a_model_in_parts_beside_other_poses_is_said(tmp_path, kind):
     (folder / "sparse/0/points3D.txt").write_bytes(b"")
     said = f"{folder / 'sparse/0'} is not used: it has no images.bin and no points3D.bin"
     assert load_scene(folder).notes == (*before, said)
-
-
-def test_tanks_and_temples_as_3dgs_has_them(tmp_path):
-    """Photos of half the size that the cameras have, rounded as it came."""
-    camera = [pinhole(241, 161, 200.0)]
-    write_model(tmp_path / "truck/sparse/0", camera, NAMES)
-    write_photos(tmp_path / "truck/images", camera, NAMES, 2)
-    scene = load_scene(tmp_path / "truck")
-    require_painted(scene)
-    assert "intrinsics rescaled from 241x161 to 120x80" in scene.notes[-1]
-
-
-def test_dtu_as_2dgs_has_it(tmp_path):
-    """RGBA photos, with masks and depths beside, and a model of the text kind."""
-    camera = [pinhole(240, 160, 200.0)]
-    write_model(tmp_path / "scan24/sparse/0", camera, NAMES, ".txt")
-    write_photos(tmp_path / "scan24/images", camera, NAMES)
-    for folder in ("mask", "depths"):
-        write_photos(tmp_path / f"scan24/{folder}", camera, NAMES)
-    for photo in (tmp_path / "scan24/images").iterdir():
-        Image.open(photo).convert("RGBA").save(photo)
-    shutil.copy(tmp_path / "scan24/images" / NAMES[0], tmp_path / "scan24/points.png")
-    require_painted(load_scene(tmp_path / "scan24"))
 
 
 @pytest.mark.parametrize("folder", ["colmap", "reconstruction/model"])

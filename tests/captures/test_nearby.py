@@ -58,41 +58,10 @@ def test_photos_of_a_colmap_capture(capture, monkeypatch):
     assert refusal(Path()) == f". {said}"
 
 
-def test_nerfstudios_own_folder_of_colmap(capture):
-    shutil.move(capture / "sparse", capture / "colmap/sparse")
-    assert refusal(capture / "colmap/sparse/0/points3D.bin") == (
-        f"{capture / 'colmap/sparse/0/points3D.bin'} lies in the capture {capture / 'colmap'} "
-        f"({capture / 'colmap/sparse/0'}): give that folder"
-    )
-    assert len(load_scene(capture / "colmap").train) == 7
-    assert f"lies in the capture {capture} (" in refusal(capture / "colmap/sparse")
-
-
-def test_a_capture_in_a_capture_that_lacks_its_photos_is_meant_itself(capture):
-    shutil.copytree(capture / "sparse", capture / "second/sparse")
-    next((capture / "images").iterdir()).unlink()  # else those are taken
-    assert "8 of 8 photos are missing in" in refusal(capture / "second")
-
-
 @pytest.mark.parametrize("place", ["inner", "datasets/plush"])
 def test_a_capture_that_lies_deeper(tmp_path, place):
     inner = with_poses(tmp_path / "x" / place)
     assert refusal(tmp_path / "x") == f"{inner} has a transforms.json: give that folder"
-
-
-def test_a_colmap_capture_that_lies_deeper(capture):
-    root = capture.parents[1]
-    assert capture.relative_to(root).as_posix() == "others/capture"
-    assert refusal(root) == f"{capture} has a sparse/0: give that folder"
-
-
-def test_several_captures_with_photos_beside(tmp_path):
-    root = tmp_path / "a/b/root"
-    names = ["images", "images2", "images3", "images4"]
-    inner = [with_poses(root / name) for name in names]
-    Image.new("RGB", (8, 8)).save(root / "overview.png")
-    shown = ", ".join(f"{folder} has a transforms.json" for folder in inner[:3])
-    assert refusal(root) == f"{shown}, ...: give one of these folders"
 
 
 def test_photos_with_their_own_reconstruction_in_them_are_alone(tmp_path):
@@ -106,11 +75,6 @@ def test_photos_with_their_own_reconstruction_in_them_are_alone(tmp_path):
     assert holds_photos_alone(photos)
     with pytest.raises(InputError, match="has 4 photos and nothing that says where"):
         load_scene(photos)
-
-
-def test_captures_more_than_two_folders_down_are_not_looked_for(tmp_path):
-    with_poses(tmp_path / "x/1/2/3")
-    assert "has neither a COLMAP reconstruction" in refusal(tmp_path / "x")
 
 
 def test_of_several_captures_in_a_folder_a_line_names_those_that_are_not_read(capture):

@@ -1,27 +1,17 @@
 """Random points: where they are drawn, and their colours, which are those of the photos."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import tiny_config
-from PIL import Image
 
-from turbogs_plugin.captures import load_scene
-from turbogs_plugin.captures import starting_points as module
 from turbogs_plugin.captures.starting_points import (
     colors_in_photos,
-    points_in_views,
     random_points,
     shares_with_points,
     starting_points,
 )
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene.photos import Photos
-from turbogs_plugin.train.evaluate import Look, evaluate
-from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Cameras
 
 VIEWS, SIZE, FOCAL = 24, (80, 60), 60.0
@@ -91,40 +81,6 @@ def test_depths_follow_extent_and_spacing():
         points, _ = starting_points(*cameras_of(ring, ring))
         distances = np.linalg.norm(points, axis=1)
         assert 1 + nearest <= distances.min() < 1.05 + nearest and 9 < distances.max() < 1 + 10 / np.cos(0.7)
-
-
-def test_shares_do_not_depend_on_how_many_are_projected_at_once(monkeypatch):
-    cameras = cameras_of(LINE, AROUND)
-    points = points_in_views(*cameras, np.tile([1.0, 5.0], (VIEWS, 1)), 300)
-    shares = shares_with_points(points, *cameras)
-    monkeypatch.setattr(module, "PROJECTED_AT_ONCE", 700)
-    np.testing.assert_array_equal(shares_with_points(points, *cameras), shares)
-    one = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.01, 0.01, 1.0], [-0.5, -0.4, 1.0], [9.0, 0.0, 1.0]])
-    straight = np.eye(4)[None], cameras[1][:1], cameras[2][:1]
-    assert shares_with_points(one, *straight).tolist() == [2 / 48]  # two cells: one point twice, one is behind
-
-
-@pytest.mark.usefixtures("few_random_points")
-def test_an_outward_ring_trains(tmp_path: Path):
-    frames = []
-    for view, pose in enumerate(poses(AROUND[::6], AROUND[::6])):
-        noise = np.random.default_rng(view).integers(0, 256, (24, 32, 3), dtype=np.uint8)
-        Image.fromarray(noise).save(tmp_path / f"f{view}.png")
-        frames.append({"file_path": f"f{view}.png", "transform_matrix": pose.tolist()})
-    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 16.0, "frames": frames}))
-    scene = load_scene(tmp_path)
-    assert "no points, so 500 random ones before the 4 cameras, which do not look at one thing" in scene.notes[0]
-    config = tiny_config(tmp_path, "optimizer.type=sparse_adam").without_plan()
-    trainer = Trainer(config, scene, torch.device("cpu"))
-
-    def psnr() -> float:
-        return evaluate(trainer.gaussians, scene.train, Look(0, config.raster)).worst_psnr
-
-    before = psnr()
-    assert before > 8  # black: 4.8
-    for _ in range(config.train.iterations):
-        trainer.step()
-    assert psnr() > before + 0.1
 
 
 def two_views() -> tuple[Cameras, Photos]:

@@ -11,7 +11,6 @@ from helpers.refusals import assert_refused
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.captures.starting_points import random_points
 from turbogs_plugin.errors import InputError
 
 SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[3] / "shared" / "scenes"))
@@ -123,14 +122,6 @@ def test_matrices_that_are_no_intrinsics(tmp_path, K, words):
     assert_refused(words, load_scene, folder)
 
 
-def test_reduced_copies(tmp_path):
-    folder = write_transforms(tmp_path / "cup")
-    (folder / "images_2").mkdir()
-    for view in range(9):
-        Image.new("RGB", (10, 5), (1, 2, 3)).save(folder / "images_2" / f"f{view}.png")
-    assert load_scene(folder, factor=2).train.photos.colors[0].tolist() == [1, 2, 3]
-
-
 def test_transparency_is_opacity(tmp_path):
     """Colours are kept as multiplied by alpha, and shown on any background."""
     scene = load_scene(write_transforms(tmp_path / "cup", mode="RGBA"))
@@ -147,13 +138,6 @@ def test_random_points_are_seeded_and_about_what_the_cameras_see(tmp_path):
     points = scene.frame.restore_points(scene.points.numpy())
     np.testing.assert_allclose(points.mean(axis=0), TARGET, atol=0.05)
     assert np.ptp(points, axis=0) == pytest.approx([math.sqrt(17)] * 3, rel=1e-2)
-
-
-def test_random_points_of_parallel_cameras():
-    viewmats = np.tile(np.eye(4), (5, 1, 1))
-    viewmats[:, 0, 3] = np.arange(5)
-    points = random_points(viewmats)
-    assert np.isfinite(points).all()
 
 
 @pytest.mark.parametrize("body", ["ascii", "binary"])
@@ -210,17 +194,6 @@ def test_colors_of_points_are_scaled_by_their_type(tmp_path, kind, given, read):
 def test_colors_of_points_that_are_not_finite_are_refused(tmp_path):
     folder = write_colored_points(tmp_path / "cup", "float32", [[0.5, 0.5, 0.5], [0.5, math.nan, 0.5]])
     assert_refused(r"points\.ply: the colours of 1 of 2 points are not finite: export it again", load_scene, folder)
-
-
-@pytest.mark.usefixtures("few_random_points")
-def test_a_ply_of_floats_without_points_leaves_them_to_be_drawn(tmp_path):
-    assert load_scene(write_colored_points(tmp_path / "cup", "float32", [])).drawn_points
-
-
-def test_a_comment_of_a_ply_may_have_any_letters(tmp_path):
-    """One of them has the byte that is a new line in Latin-1."""
-    folder = write_colored_points(tmp_path / "cup", "uint8", [[1, 2, 3]], comment="grün, Ålesund")
-    assert load_scene(folder).point_colors.tolist() == [[1, 2, 3]]
 
 
 def set_pose(value):
@@ -313,14 +286,6 @@ def test_a_mark_at_the_beginning_of_the_file(tmp_path):
     source = folder / "transforms.json"
     source.write_bytes(b"\xef\xbb\xbf" + source.read_bytes())
     assert len(load_scene(folder).train) == 7
-
-
-def test_its_own_frame_is_kept(tmp_path):
-    """applied_transform and applied_scale say how the poses became what they are: nothing is to be undone."""
-    plain = load_scene(write_transforms(tmp_path / "plain"))
-    turned = [[0, 1, 0, 2], [1, 0, 0, 0], [0, 0, -1, 0]]
-    moved = load_scene(write_transforms(tmp_path / "cup", applied_transform=turned, applied_scale=0.5))
-    np.testing.assert_array_equal(plain.train.cameras.viewmats, moved.train.cameras.viewmats)
 
 
 @pytest.mark.parametrize("text", ["", "[1, 2", "[" * 100_000, "\x00\xff", "3"])
@@ -436,19 +401,6 @@ def test_neighbours_with_another_suffix_that_are_no_photos(tmp_path):
     assert load_scene(folder).notes[1] == left_out.replace("of 9", "of 10")
 
 
-@pytest.mark.skipif(not (SCENES / "fox-raw").is_dir(), reason=f"no real captures in {SCENES}")
-def test_real_capture_as_published(tmp_path):
-    """Its file of cameras, and every fifth of its photos."""
-    (tmp_path / "transforms.json").write_bytes((SCENES / "fox-raw/transforms.json").read_bytes())
-    (tmp_path / "images").mkdir()
-    for photo in sorted((SCENES / "fox-raw/images").iterdir())[::5]:
-        (tmp_path / "images" / photo.name).symlink_to(photo)
-    scene = load_scene(tmp_path, factor=8)
-    assert (len(scene.train), len(scene.test)) == (8, 2)
-    assert "57 of 67 frames are left out" in scene.notes[1]
-    assert scene.notes[2].startswith("10 photos undistorted: OPENCV 1080x1920 -> PINHOLE 10")
-
-
 def listed(*views: int) -> list[str]:
     return [f"./images/f{view}.png" for view in views]
 
@@ -481,12 +433,6 @@ def test_names_of_a_split_are_those_of_frames_without_suffix_too(tmp_path):
     folder = write_transforms(tmp_path / "cup", test_filenames=["images/f3", "images/f5.png"])
     edit(folder, lambda content: [frame.update(file_path=frame["file_path"][:-4]) for frame in content["frames"]])
     assert load_scene(folder).test.names == ("f3.png", "f5.png")
-
-
-def test_random_points_are_about_what_the_training_cameras_see(tmp_path):
-    scene = load_scene(write_transforms(tmp_path / "cup", train_filenames=listed(0, 1, 2, 3, 4)))
-    alone = random_points(np.linalg.inv([camera_to_world(0.5 * view) @ np.diag([1, -1, -1, 1]) for view in range(5)]))
-    np.testing.assert_allclose(scene.frame.restore_points(scene.points.numpy()), alone, atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ import pytest
 from helpers.refusals import assert_refused
 from PIL import Image
 
-from turbogs_plugin.captures import load_scene, undistort
-from turbogs_plugin.captures.colmap import read_colmap
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.undistort import brown_projection, lens_of_camera
 
 pytestmark = pytest.mark.usefixtures("few_random_points")
@@ -275,26 +274,6 @@ def test_a_wide_fisheye_keeps_to_60_degrees_off_the_axis():
     assert (extent < np.tan(np.pi / 3) + 0.01).all() and extent.max() > 1.5  # of 173 degrees at the photo's rim
 
 
-def test_cameras_with_equal_numbers_have_one_lens(tmp_path):
-    folder = write_colmap(tmp_path / "cup", "OPENCV", PARAMS["OPENCV"], np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8))
-    model = folder / "sparse" / "0"
-    pycolmap.Reconstruction(model).write_text(model)
-    for file in model.glob("*.bin"):
-        file.unlink()
-    cameras = (model / "cameras.txt").read_text().splitlines()
-    line = next(line for line in cameras if line[0] != "#")
-    (model / "cameras.txt").write_text("\n".join([*cameras, f"2{line[1:]}", f"3{line[1:]}"]) + "\n")
-    images = (model / "images.txt").read_text()
-    for rigs in ("rigs.txt", "frames.txt"):
-        (model / rigs).unlink(missing_ok=True)
-    for view, number in ((1, 2), (2, 3)):
-        images = images.replace(f" 1 {view}.png", f" {number} {view}.png")
-    (model / "images.txt").write_text(images)
-    capture = read_colmap(folder, model, ".txt")
-    assert capture.lenses[0] is not None and len({id(lens) for lens in capture.lenses}) == 1
-    assert "more cameras" not in undistort.undistortion_note(capture.lenses)
-
-
 @pytest.mark.parametrize("copies", [False, True])
 def test_reduced_photos_are_undistorted(tmp_path, copies):
     params = PARAMS["OPENCV"]
@@ -308,15 +287,6 @@ def test_reduced_photos_are_undistorted(tmp_path, copies):
     scene, full = load_scene(folder, factor=2), load_scene(folder)
     assert (np.abs(scene.train.cameras.sizes - full.train.cameras.sizes / 2) <= 0.5).all()
     require_straight(scene, levels=6.0)  # an average over 2x2 pixels is not the colour in their middle
-
-
-def test_photos_smaller_than_their_camera_are_undistorted(tmp_path):
-    params = PARAMS["OPENCV"]
-    photo = bent_photo("OPENCV", params)
-    small = np.asarray(Image.fromarray(photo).resize((WIDTH // 2, HEIGHT // 2), Image.Resampling.BOX))
-    scene = load_scene(write_colmap(tmp_path / "cup", "OPENCV", params, small))
-    require_straight(scene, levels=6.0)
-    assert "intrinsics rescaled from 320x240 to 160x120" in scene.notes[-2]
 
 
 def test_undistorted_colors_are_rounded_to_the_nearest():

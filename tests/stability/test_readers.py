@@ -115,27 +115,6 @@ def test_other_values_in_files_of_frames(photos, kind):
     assert 60 < refused < 150
 
 
-@pytest.mark.usefixtures("few_random_points")
-def test_other_values_in_a_table_of_llff(photos):
-    rows = [
-        [*np.c_[np.array(pose(view))[:3, [1, 0, 2, 3]] * [-1, 1, 1, 1], [12, 16, 14]].ravel(), 1, 9]
-        for view in range(5)
-    ]
-    choice, refused = random.Random("llff"), 0
-    for _ in range(300):
-        table = np.array(rows, dtype=choice.choice([np.float64, np.float32]))
-        with np.errstate(over="ignore"):
-            for _ in range(choice.choice([1, 1, 3])):
-                place = choice.randrange(5), choice.randrange(17)
-                table[place] = choice.choice([*NUMBERS, table[place] * choice.choice([1.001, -1, 1e6, 1e-6])])
-        np.save(photos / "poses_bounds.npy", table)
-        result = outcome_within(MEMORY, load_scene, photos)
-        refused += isinstance(result, InputError)
-        if not isinstance(result, InputError):
-            require_whole(result)
-    assert 100 < refused < 300
-
-
 # ---- Models to start from ----------------------------------------------------------------------------------------
 
 

@@ -40,7 +40,7 @@ def read_blender(scene: Path) -> Capture:
     require_enough(scene, source, train.absent, len(train.views) + len(train.absent), train.unclear)
     test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
     test = FrameViews() if test_file is None else read_frame_views(scene, test_file, lenses, remedy)[1]
-    if in_both := sorted(train.views.keys() & test.views.keys()):
+    if test_file and (in_both := sorted(train.views.keys() & test.views.keys())):
         raise InputError(
             f"{scene}: {len(in_both)} photos stand both in {TRAIN_FILE} and in {test_file.name} ({in_both[0]}): take "
             f"them out of one; without {' and '.join(TEST_FILES)} every 8th photo is for testing"

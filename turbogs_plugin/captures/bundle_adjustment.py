@@ -30,29 +30,27 @@ PRIOR = 0.006
 """Standard deviation of every parameter of a camera before any is learnt, in the units of `Pinholes.moved`: four to six
 pixels at the edge of a photo of 1200."""
 SMALLEST_VARIANCE = 1e-14
-"""Of the prior, so that it can be inverted."""
+"""Smallest variance in the prior, so that it can be inverted."""
 POINT_DAMPING = 1e-4
-"""Of a point's normal equations, relative to their trace: in a direction that no photo tells, a point stays."""
+"""Damping of a point's normal equations, relative to their trace: a point stays in a direction that no photo tells."""
 FEWEST_OBSERVATIONS = 30
 """A photo with fewer keeps its camera: three a parameter."""
 FINEST = 0.02
 """Pixels: errors below are not taken for noise of the features, however exact a reconstruction is."""
 FARTHEST_MATCH = 0.02
-"""Of a photo's width: where half of the points are farther than that from where photos show them, the photos are not
+"""Share of a photo's width: where half of the points are farther than that from where photos show them, the photos are not
 those that were reconstructed."""
 PARAMETERS = 10
 DERIVATIVES = (
     ((0, 4, -1), (1, 0, 1), (1, 3, 1), (2, 2, -1), (3, 6, 1), (5, 7, -1), (6, 1, 1)),
     ((0, 0, -1), (0, 5, -1), (1, 4, 1), (2, 1, 1), (4, 6, 1), (5, 8, -1), (7, 2, 1)),
 )
-"""Of a pixel's x and of its y, by parameters of `Pinholes.moved`: (parameter, function of `_Adjustment._camera_sums`,
+"""Derivatives of a pixel's x and y by parameters of `Pinholes.moved`: (parameter, function of `_Adjustment._camera_sums`,
 sign), in units of the focal length, and from function 6 on of the depth. Those by the principal point are left out."""
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
-"""Of a symmetric 3x3 matrix, rows and columns of the entries that are computed."""
+"""Rows and columns of the entries of a symmetric 3x3 matrix that are computed."""
 CHUNK = 30_000
 """Observations at once: few large operations, whose results stay in the processor's cache."""
-QUIET = dict.fromkeys(("divide", "invalid", "over"), "ignore")
-"""For numpy: what is not finite gets a weight of zero."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class Pinholes:
 
     @classmethod
     def of(cls, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> Pinholes:
-        """From world to camera [V, 4, 4], intrinsics [V, 3, 3] in pixels, and sizes [V, 2] (width, height)."""
+        """The cameras of world-to-camera matrices [V, 4, 4], intrinsics [V, 3, 3] in pixels, and sizes [V, 2] (width, height)."""
         return cls(viewmats[:, :3, :3], viewmats[:, :3, 3], Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2], 0.5 * sizes[:, 0])
 
     def where(self, kept: np.ndarray, others: Pinholes) -> Pinholes:
@@ -235,17 +233,17 @@ class _Adjustment:
         return np.split(values, self.starts[1:-1])
 
     def _parts(self, first: int, last: int) -> Iterator[tuple[int, slice]]:
-        """Of views `first` to `last`: each, and where its observations stand among theirs."""
+        """Each of the views `first` to `last`, and the place of its observations among theirs."""
         bounds = itertools.pairwise((self.starts[first : last + 1] - self.starts[first]).tolist())
         return ((view, slice(*own)) for view, own in enumerate(bounds, first))
 
     def _seen(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the observations of views: x / z, y / z and z in the camera [3, n]; residuals [2, n]; their lengths [n],
+        """The observations of views: x / z, y / z and z in the camera [3, n]; residuals [2, n]; their lengths [n],
         infinite behind the camera."""
         part, cameras = slice(self.starts[first], self.starts[last]), self.cameras
         sights = np.take(self.places, self.point_ids[part], axis=1)
         residuals = np.empty((2, sights.shape[1]))
-        with np.errstate(**QUIET):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
             for view, own in self._parts(first, last):
                 sights[:, own] = cameras.rotations[view] @ sights[:, own] + cameras.translations[view][:, None]
                 sights[:2, own] /= sights[2, own]
@@ -255,10 +253,10 @@ class _Adjustment:
         return sights, residuals, np.where((sights[2] > 0) & np.isfinite(errors), errors, math.inf)
 
     def _counted(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of the observations of views: x / z, y / z and 1 / z in the camera [3, n]; residuals [2, n]; Cauchy's weights
+        """The observations of views: x / z, y / z and 1 / z in the camera [3, n]; residuals [2, n]; Cauchy's weights
         [n], in units of the noise. All are 0 where the error is infinite."""
         sights, residuals, errors = self._seen(first, last)
-        with np.errstate(**QUIET):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
             np.divide(1.0, sights[2], out=sights[2])
             weights = 1.0 / (self.scale**2 + errors * errors)
         if (left_out := weights == 0).any():
@@ -280,7 +278,7 @@ class _Adjustment:
 
     def _camera_factors(self) -> np.ndarray:
         """[V, 2, PARAMETERS, 9]: how x and y of a pixel change by each parameter of its camera, in factors of functions
-        of the point, which are those of `_camera_sums`."""
+        of the point, listed at `_camera_sums`."""
         factors = np.zeros((len(self.depths), 2, PARAMETERS, 9))
         for axis, (derivatives, focal) in enumerate(zip(DERIVATIVES, self.cameras.focal.T, strict=True)):
             for parameter, function, sign in derivatives:
@@ -317,14 +315,14 @@ class _Adjustment:
         seen = np.bincount(self.point_ids, entries[0] + entries[3] + entries[5] > 0, count)
         sums = np.stack([np.bincount(self.point_ids, values, count) for values in entries])  # [9, M]
         traces = sums[0] + sums[3] + sums[5]
-        with np.errstate(**QUIET):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
             sums = sums / traces
             sums[[0, 3, 5]] += POINT_DAMPING
             self.places += np.where((seen >= 2) & (traces > 0), _solved(*sums), 0.0)
 
     def _point_factors(self) -> np.ndarray:
         """[V, 9, 9]: six of a symmetric matrix and three of a vector, of a point's normal equations in the world, in
-        factors of functions of what a photo shows of it, which are those of `_point_entries`."""
+        factors of functions of what a photo shows of it, listed at `_point_entries`."""
         across, down, ahead = self.cameras.rotations.swapaxes(0, 1)  # [V, 3] each
         (fx, fy), (i, j) = self.cameras.focal.T[:, :, None], UPPER
         factors = np.zeros((len(fx), 9, 9))

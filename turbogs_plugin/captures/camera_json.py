@@ -23,7 +23,7 @@ FISHEYE_MODELS = ("OPENCV_FISHEYE",)
 MATRICES = ("K", "intrinsic_matrix")
 """Keys of intrinsics as a matrix, of which NeuS2 writes the second."""
 LARGEST_SKEW = 0.5
-"""Of their entry [0, 1], in pixels: decompositions of projections leave a small one, which counts as none."""
+"""Largest entry [0, 1] of a matrix of intrinsics, in pixels, that counts as none: decompositions leave a small one."""
 
 
 def read_frames(source: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -55,7 +55,7 @@ def read_camera(
     """[3, 3] float64 intrinsics, (width, height), and the lens where there is distortion, of one frame.
 
     Args:
-        values: those of the frame, before those for all frames.
+        values: the frame's own, before the file's for all frames.
         lenses: those already made, by their numbers; a new one is added.
     """
     K, size = _intrinsics(values, photo, source)
@@ -68,7 +68,7 @@ def read_camera(
             "COLMAP reconstruction"
         )
     fisheye = model in FISHEYE_MODELS
-    bends = tuple(number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    bends = tuple(number(key, 0.0) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if unknown := [key for key in ("k5", "k6", *(("p1", "p2") if fisheye else ())) if number(key, 0.0)]:
         raise InputError(
             f"{source}: the {model} camera of {photo.name} has {' and '.join(unknown)}, which the model does not have: "
@@ -124,7 +124,7 @@ def pinhole(values: dict, source: Path, size: tuple[float, float], angles: str =
     Of `MATRICES` where there is neither ``fl_x`` nor an angle.
 
     Args:
-        values: those of the frame, before those for all frames.
+        values: the frame's own, before the file's for all frames.
         size: (width, height), in whose middle the principal point is unless it is given.
         angles: axes whose ``camera_angle`` serves where there is no ``fl``.
     """

@@ -1,15 +1,15 @@
 """A scene whose photos have cameras of their own (`turbogs_plugin.captures.bundle_adjustment`).
 
 Training photos and points are refined together. Test photos keep the cameras that they were given, as errors are to be
-compared with those of other programs, which have no others. Beside them they get refined ones, by where they show the
-points that training starts from, however that is set: errors by these are of the model alone, and not of the camera.
+compared with other programs' errors, which are by the given ones. Beside them they get refined ones, by where they show
+the points that training starts from, however that is set: errors by these are of the model alone, not of the camera.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -49,7 +49,7 @@ class RefinedCameras:
             training: False: training cameras and points stay, and only the test photos get cameras beside theirs.
 
         Returns:
-            It has a `reprojection_error`, that of the cameras that are trained with.
+            The scene, whose `reprojection_error` is by the cameras that are trained with.
         """
         together, points = self.together, scene.points.double().numpy()
         scene = replace(scene, reprojection_error=together.before)
@@ -87,19 +87,27 @@ def refine_cameras(scene: Scene, training: bool = True) -> Scene:
     return with_cameras(scene, find_cameras(scene.train.posed, scene.test.posed, scene.points), training)
 
 
-def load_and_find(path: str | Path, *settings: Any, find: bool = True) -> tuple[Scene, RefinedCameras | None]:
-    """What `load_scene` and `find_cameras` give, the second while photos are decoded.
+def load_and_find(
+    path: str | Path,
+    factor: int = 1,
+    test_every: int = 8,
+    progress: Callable[[int, int], object] | None = None,
+    sized: Callable[[np.ndarray, np.ndarray], object] | None = None,
+    find: bool = True,
+) -> tuple[Scene, RefinedCameras | None]:
+    """A scene, and the cameras that `find_cameras` finds while its photos are decoded.
 
     Args:
-        settings: further ones of `load_scene`.
-        find: False: None is the second.
+        path, factor, test_every, progress, sized: as for `load_scene`.
+        find: False: no cameras are looked for.
 
     Raises:
         InputError: as `load_scene`.
     """
     found: list[RefinedCameras | None] = []
     meanwhile = (lambda *posed: found.append(find_cameras(*posed))) if find else None
-    return load_scene(path, *settings, meanwhile=meanwhile), found[0] if found else None
+    scene = load_scene(path, factor, test_every, progress, sized, meanwhile)
+    return scene, found[0] if found else None
 
 
 def _usable(views: PosedViews, points: np.ndarray) -> Observations | None:
@@ -111,7 +119,7 @@ def _usable(views: PosedViews, points: np.ndarray) -> Observations | None:
 
 
 def _pinholes(cameras: Cameras) -> Pinholes:
-    """The same cameras."""
+    """Cameras as float64 arrays."""
     viewmats, Ks = (matrices.cpu().double().numpy() for matrices in (cameras.viewmats, cameras.Ks))
     return Pinholes.of(viewmats, Ks, cameras.sizes)
 

@@ -14,7 +14,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.scene import Observations
 
 FEWEST_PHOTOS = 3
-"""A capture has at least so many."""
+"""Fewest photos of a capture."""
 
 LARGEST_SIDE = 65535
 """Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
@@ -36,7 +36,7 @@ class Capture:
         points: [M, 3] float64.
         point_colors: [M, 3] uint8; None: the points were drawn at random, and their colours are taken from the photos
             (`colors_in_photos`).
-        lenses: one a view, None where the photo is that of a pinhole camera; given as empty where all are.
+        lenses: one a view, None for a pinhole camera; given as empty where all are.
         notes: what the capture was taken for, and what was done with it: lines for the user.
         test: [V] bool, the test views of the capture's own split; None: views are split by their order.
         reduction: the photos are already smaller than the capture's full size by this factor.
@@ -135,7 +135,7 @@ def check_photo_name(name: str, source: Path) -> str:
 
 
 def sizes_text(sizes: np.ndarray) -> str:
-    """Of photos of `sizes` [V, 2]: ``800x600``, or the one with fewest and the one with most pixels."""
+    """Sizes of photos [V, 2] in words: ``800x600``, or the size with fewest and the one with most pixels."""
     ordered = sizes[np.lexsort((sizes[:, 0], np.prod(sizes, axis=1)))]  # of equally many pixels, the upright one first
     ends = (f"{width:g}x{height:g}" for width, height in ordered[[0, -1]])
     return " to ".join(dict.fromkeys(ends))

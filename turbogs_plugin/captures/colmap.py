@@ -132,7 +132,8 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     absent = [name for name, found in zip(names, there, strict=True) if not found]
     absence = [left_out(absent, len(names), "images")] if absent and sum(there) >= FEWEST_PHOTOS else []
     if absence:
-        images, cameras, names = (tuple(itertools.compress(each, there)) for each in (images, cameras, names))
+        images, cameras = list(itertools.compress(images, there)), list(itertools.compress(cameras, there))
+        names = tuple(itertools.compress(names, there))
     made: dict[tuple, Lens] = {}
     lenses = {image.camera: _lens(model.cameras[image.camera], folder, made) for image in images}
     lens_of_view = tuple(lenses[image.camera] for image in images)
@@ -141,7 +142,8 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     intrinsics = np.array([camera.calibration_matrix() if lens is None else lens.K for camera, lens in pairs])
     sizes = np.array([(camera.width, camera.height) if lens is None else lens.size for camera, lens in pairs])
     intrinsics, sizes = intrinsics.reshape(-1, 3, 3), sizes.reshape(-1, 2).astype(np.int64)
-    if reduction > 1 and there[0] and 1.5 * photo_size(photo_folder / names[0])[0] > cameras[0].width:
+    first = photo_folder / next(iter(names), "")
+    if reduction > 1 and first.is_file() and 1.5 * photo_size(first)[0] > cameras[0].width:
         reduction = 1  # the cameras are those of the copies
     points, colors = model.points["xyz"].copy(), model.points["color"].copy()
     shown = f"{len(points):,} points"

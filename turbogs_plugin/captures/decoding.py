@@ -31,9 +31,9 @@ AS_STORED = {
 }
 """What turns an upright picture to how a file of this EXIF orientation has it; others have it upright."""
 SMALLEST_SIDE = 4
-"""The shorter side of a reduced photo has at least so many pixels: of fewer, nothing is left to see."""
+"""The shorter side of a reduced photo has at least this many pixels; of fewer, nothing is left to see."""
 OPAQUE_SUFFIXES = (".jpg", ".jpeg")
-"""Of files whose headers need not be read again, as their format has no alpha."""
+"""Suffixes of formats without alpha, whose headers need not be read again."""
 DECODING_BYTES = 24
 """Bytes of a pixel while its photo is decoded, undistorted and reduced: several copies, one of them in float32."""
 MEMORY_SHARE = 0.25
@@ -128,7 +128,7 @@ def load_photos(
         paths: V files.
         sizes: [V, 2] int64 (width, height) that the files must have.
         targets: [V, 2] int64 (width, height) to give them.
-        lenses: one a photo, None for those of pinhole cameras.
+        lenses: one a photo, None for a pinhole camera.
         colors: where to put them, as `photo_array` gives it. With 3 channels, photos that are transparent lose their
             alpha and keep their colours as stored.
         loaded: called after each photo, by several threads.
@@ -172,7 +172,11 @@ def load_photos(
 
 
 def decoding_threads(bytes_each: int = 0) -> ThreadPoolExecutor:
-    """As many as there are processors for this process, but no more than `MEMORY_SHARE` of the free memory allows."""
+    """Threads to decode photos: one a processor of this process, but no more than `MEMORY_SHARE` of free memory allows.
+
+    Args:
+        bytes_each: memory that one thread takes.
+    """
     wanted = min(MOST_THREADS, processor_cores())
     affordable = int(MEMORY_SHARE * free_host_bytes()) // bytes_each if wanted * bytes_each > SMALL_WORK else wanted
     return ThreadPoolExecutor(max(1, min(wanted, affordable)))

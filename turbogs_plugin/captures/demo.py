@@ -103,7 +103,7 @@ class Disc(Solid):
         return np.where((distances > 0) & (hits[:, 0] ** 2 + hits[:, 1] ** 2 < self.size**2), distances, np.inf)
 
     def normal(self, points: np.ndarray) -> np.ndarray:
-        return np.broadcast_to(np.float32([0, 0, 1]), points.shape)
+        return np.broadcast_to(np.array([0, 0, 1], dtype=np.float32), points.shape)
 
 
 def checker(size: float, first: np.ndarray, second: np.ndarray) -> Texture:
@@ -138,14 +138,16 @@ def demo_solids(random: np.random.Generator) -> list[Solid]:
     def mixed(size: float) -> Texture:
         return noise(size, color(), color(), random)
 
-    vector = np.float32
+    def vector(*values: float) -> np.ndarray:
+        return np.array(values, dtype=np.float32)
+
     return [
-        Disc(1.7, mixed(0.8), vector((0, 0, 0)), turn()),
-        Box(vector((0.35, 0.35, 0.45)), checker(0.23, color(), color()), vector((0.1, 0.0, 0.45)), turn()),
-        Sphere(0.36, mixed(0.5), vector((-0.85, 0.35, 0.36)), turn()),
-        Sphere(0.28, checker(0.2, color(), color()), vector((0.55, -0.85, 0.28)), turn()),
-        Box(vector((0.4, 0.18, 0.15)), mixed(0.4), vector((-0.5, -0.75, 0.15)), turn()),
-        Box(vector((0.15, 0.15, 0.3)), mixed(0.3), vector((0.8, 0.65, 0.3)), turn()),
+        Disc(1.7, mixed(0.8), vector(0, 0, 0), turn()),
+        Box(vector(0.35, 0.35, 0.45), checker(0.23, color(), color()), vector(0.1, 0.0, 0.45), turn()),
+        Sphere(0.36, mixed(0.5), vector(-0.85, 0.35, 0.36), turn()),
+        Sphere(0.28, checker(0.2, color(), color()), vector(0.55, -0.85, 0.28), turn()),
+        Box(vector(0.4, 0.18, 0.15), mixed(0.4), vector(-0.5, -0.75, 0.15), turn()),
+        Box(vector(0.15, 0.15, 0.3), mixed(0.3), vector(0.8, 0.65, 0.3), turn()),
     ]
 
 

@@ -10,7 +10,7 @@ import torch
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 
 NO_MASKS = torch.zeros(0, dtype=torch.int64)
-"""In the place of the views' counts of unmasked pixels."""
+"""Counts of unmasked pixels where a capture has no masks."""
 ROUNDING = 1e-5
 """Two readings of one reconstruction differ by less: in extents, and relative to each intrinsic."""
 

@@ -2,7 +2,7 @@
 
 A row has 17 numbers: a 3x5 matrix [R | t | hwf] in row-major order, then the nearest and the farthest depth. The
 columns of R are the camera's axes in the world (down, right, backward), t is the camera's centre, and hwf are height,
-width and focal length of the full-size photos in pixels. The rows are those of the photos in name order.
+width and focal length of the full-size photos in pixels. There is a row for each photo, in name order.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def read_llff(scene: Path, factor: int = 1) -> Capture:
 
     Args:
         scene: the folder.
-        factor: the capture is to be loaded at this part of its full size. Of the folders of photos, that of the
-            smallest photos is taken which are not smaller than that; with a factor of 1 and no full-size photos, the
+        factor: the capture is to be loaded at this part of its full size. The folder with the smallest photos is
+            taken that are not smaller than that; with a factor of 1 and no full-size photos, the
             largest ones that are there. `Capture.reduction` says which.
 
     Raises:
@@ -140,7 +140,7 @@ def _is_whole_copy(reduction: int, photos: list[Path], full_sizes: np.ndarray) -
 
 
 def _checked_sizes(photos: list[Path], full_sizes: np.ndarray, source: Path) -> np.ndarray:
-    """[V, 2] int64 sizes of a folder's photos, which are those of the file at a uniform scale."""
+    """[V, 2] int64 sizes of a folder's photos, which have the file's sizes at a uniform scale."""
     if len(photos) != len(full_sizes):
         missing = len(full_sizes) - len(photos)
         remedy = "take out the photos without a pose (COLMAP leaves out what it cannot place)"
@@ -151,13 +151,6 @@ def _checked_sizes(photos: list[Path], full_sizes: np.ndarray, source: Path) -> 
             f"{AGAIN}"
         )
     sizes = photo_sizes(photos)
-    other = (sizes != sizes[0]).any(axis=1) & (full_sizes == full_sizes[0]).all(axis=1)
-    if other.any():
-        view = int(np.argmax(other))
-        raise InputError(
-            f"photo {photos[view]} is {sizes_text(sizes[[view]])} but the first one is "
-            f"{sizes_text(sizes[:1])}, and {FILE} has one size for both: use the photos that it was written for"
-        )
     # Either side of a reduced photo may be rounded by up to a pixel.
     ratios = sizes / full_sizes
     bent = np.abs(ratios[:, 0] - ratios[:, 1]) > (1.0 / full_sizes).sum(axis=1)

@@ -1,4 +1,4 @@
-"""From a path to a scene that can be trained on."""
+"""Loading: a folder becomes a scene that can be trained on."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def load_scene(
             if progress is not None:
                 progress(next(counter), int(seen.sum()))
 
-    works = (None if meanwhile is None else partial(meanwhile, *posed, points), None)
+    works = (None if meanwhile is None else partial(meanwhile, posed[0], posed[1], points), None)
     train, tested = (
         _load_views(capture, files, views, masks, posed_views, room, loaded, work)
         for views, posed_views, room, work in zip(parts, posed, colors, works, strict=True)
@@ -228,9 +228,10 @@ def _masked_note(
 ) -> str:
     """How much is masked, by the photos' alpha where no file does it, and which views are left out for it, in one line;
     empty where nothing is masked."""
-    if not (cut := [view for view, mask in enumerate(masks) if mask is not None]):
+    pixels = {view: mask.pixels for view, mask in enumerate(masks) if mask is not None}
+    if not (cut := list(pixels)):
         return ""
-    share = 1.0 - sum(masks[view].pixels for view in cut) / int(sizes[cut].prod(axis=1).sum())
+    share = 1.0 - sum(pixels.values()) / int(sizes[cut].prod(axis=1).sum())
     gone = [name for name, kept in zip(names, seen, strict=True) if not kept]
     left_out = f"; {len(gone)} masked whole are left out: {gone[0]}, ..." if gone else ""
     by_alpha = sum(files[view] is None for view in cut)

@@ -38,7 +38,7 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
 
     Those that the capture names come first. Others are ``masks/NAME.png`` or COLMAP's ``masks/NAME.EXTENSION.png``,
     else of the photo's own name or ``masks/NAME.jpg``, in the capture or beside the folder of its photos. For photos
-    of ``images_4`` those of ``masks_4`` come first.
+    of ``images_4``, masks of ``masks_4`` come first.
 
     Args:
         photos: the V files.
@@ -74,7 +74,7 @@ def misnamed(parents: Iterable[Path]) -> str:
 
 
 def in_folders(folders: Sequence[Path], photo: str) -> Path | None:
-    """The mask of a photo in the first of these folders that has one; `photo` is relative to that of the photos."""
+    """The mask of a photo in the first of these folders that has one; `photo` is relative to the folder of photos."""
     stem = PurePosixPath(photo).with_suffix("")
     names = (f"{stem}.png", f"{photo}.png", photo, *(f"{stem}{suffix}" for suffix in JPEG_SUFFIXES))
     return next((folder / name for folder in folders for name in names if (folder / name).is_file()), None)
@@ -87,7 +87,7 @@ def load_masks(
 
     Args:
         files: V masks, or None.
-        photos: the V photos; where the capture's alpha is a mask, that of theirs counts too.
+        photos: the V photos; where the capture's alpha is a mask, their alpha counts too.
         capture: says what lenses and full sizes the photos have.
         sizes: [V, 2] int64 (width, height) of the photos' files.
         targets: [V, 2] int64 (width, height) that the photos get.
@@ -103,8 +103,8 @@ def load_masks(
     def load(view: int) -> ViewMask | None:
         size = tuple(sizes[view].tolist())
         parts = []
-        if files[view] is not None:
-            parts.append(_read(files[view], photos[view], size, tuple(full_sizes[view].tolist())))
+        if (file := files[view]) is not None:
+            parts.append(_read(file, photos[view], size, tuple(full_sizes[view].tolist())))
         if capture.alpha == "mask" and photos[view].suffix.lower() not in OPAQUE_SUFFIXES:
             with opened_image(photos[view]) as image:
                 if is_transparent(image):
@@ -147,7 +147,7 @@ def _placed(keep: np.ndarray, lens: Lens | None, target: tuple[int, int]) -> np.
     """[H, W] bool: the mask after what is done to its photo."""
     if lens is not None:
         image = np.where(keep, np.uint8(255), np.uint8(0))[:, :, None]
-        keep = lens.undistort(image, lens.size_of((keep.shape[1], keep.shape[0])))[:, :, 0] == 255
+        keep = np.equal(lens.undistort(image, lens.size_of((keep.shape[1], keep.shape[0])))[:, :, 0], 255)
     return _reduced(keep, target)
 
 

@@ -1,4 +1,4 @@
-"""From the names of photos that a capture has to files."""
+"""Photo files: where they lie that a capture names, one rule for COLMAP's names and one for frames of JSON files."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def _with_stem(index: Index, name: PureWindowsPath, beside: bool) -> list[PurePo
 
 
 def _in_its_folder(file: PurePosixPath, name: PureWindowsPath) -> bool:
-    """Whether a file lies in the folder that a name says, or for an absolute name in the last part of that."""
+    """Whether a file lies in the folder that a name says, or an absolute name ends with."""
     parts, others = file.parts[:-1], name.parts[:-1]
     return parts == others or (bool(name.anchor) and bool(parts) and parts == others[-len(parts) :])
 

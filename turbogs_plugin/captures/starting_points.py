@@ -13,9 +13,9 @@ from turbogs_plugin.types import Cameras
 
 NUM_RANDOM_POINTS = 50_000
 CELLS, ENOUGH_CELLS = (8, 6), 0.25
-"""A view whose image, cut into so many columns and rows, has points in a smaller share of these cells, lacks points."""
+"""Columns and rows of the cells that a view's image is cut into, and the share of them that must have points."""
 PROBES = 10_000
-"""Of the random points, so many are projected into all views."""
+"""Random points that are projected into all views."""
 PROJECTED_AT_ONCE = 1 << 20
 """Points times views: it bounds memory."""
 LEAST_SPACING = 1e-2
@@ -48,7 +48,7 @@ def random_points(viewmats: np.ndarray) -> np.ndarray:
 def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, str]:
     """Points for a capture without any, the same for the same cameras, and how they were drawn.
 
-    They are those of `random_points`, where all views see enough of these. In proportion to the views that do not, part
+    `random_points` serve, where all views see enough of them. In proportion to the views that do not, part
     of them is drawn within these views instead: between half of the cameras' extent, or less where cameras stand
     closer, and ten times it.
 
@@ -114,7 +114,7 @@ def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
         return 0.5, 10.0
     if not np.isfinite(extent):
         return extent, extent
-    # Cameras of a rig stand in one place: the spacing is that of places.
+    # Cameras of a rig stand in one place: the spacing is between places.
     rounded = np.round(((centers - mean) / (LEAST_SPACING * extent)).clip(-1e15, 1e15))
     places = torch.from_numpy(np.unique(rounded, axis=0))
     spacing = float(mean_neighbor_distances(places, 1).median()) * LEAST_SPACING if len(places) > 1 else 1.0

@@ -63,7 +63,7 @@ class Lens:
     def size_of(self, photo_size: tuple[int, int]) -> tuple[int, int]:
         """(width, height) of the pinhole's image for photos of another size than those that it was calibrated on."""
         ratios = np.divide(photo_size, self.photo_size)
-        width, height = np.floor(self.size * ratios + 0.5).astype(np.int64).tolist()
+        width, height = np.floor(np.multiply(self.size, ratios) + 0.5).astype(np.int64).tolist()
         return max(width, 1), max(height, 1)
 
     def undistort(self, photo: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -84,8 +84,8 @@ class Lens:
             rows = slice(first, first + ROWS_AT_ONCE)
             lines = _between(self.sources, down[0][rows], down[1][rows, None, None])  # [R, LATTICE, 2]
             grid = _between(lines.transpose(1, 0, 2), across[0], across[1][:, None, None])  # [width, R, 2]
-            grid = torch.from_numpy(np.ascontiguousarray(grid.transpose(1, 0, 2)))[None]
-            band = F.grid_sample(planes, grid, padding_mode="border", align_corners=False)[0]
+            sources = torch.from_numpy(np.ascontiguousarray(grid.transpose(1, 0, 2)))[None]
+            band = F.grid_sample(planes, sources, padding_mode="border", align_corners=False)[0]
             result[rows] = band.add_(0.5).to(torch.uint8).permute(1, 2, 0).numpy()
         return result
 

@@ -6,7 +6,7 @@ import numpy as np
 from torch import Tensor
 
 LARGEST_DEVIATION = 1e-2
-"""Axes whose products differ from those of a rotation by more are refused."""
+"""Largest deviation of axes' products from a rotation's."""
 
 
 def camera_centers(viewmats: np.ndarray) -> np.ndarray:

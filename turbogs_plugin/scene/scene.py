@@ -32,7 +32,7 @@ class Observations:
         return len(self.pixels)
 
     def of_views(self, views: np.ndarray, ratios: np.ndarray) -> Observations:
-        """Those of some views, which become the first, second, ...; in pixels of photos of another size.
+        """The observations by some views, which become the first, second, ...; in pixels of photos of another size.
 
         Args:
             views: [W] int64, ascending.
@@ -89,7 +89,7 @@ class PosedImages:
         return replace(self.with_cameras_on(device), photos=self.photos.to(device))
 
     def with_cameras_on(self, device: torch.device | str) -> PosedImages:
-        """The same photos, with their cameras on a device."""
+        """These photos where they are, with their cameras on a device."""
         refined = None if self.refined is None else self.refined.to(device)
         return replace(self, cameras=self.cameras.to(device), refined=refined)
 
