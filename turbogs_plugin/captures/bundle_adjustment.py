@@ -38,15 +38,15 @@ FEWEST_OBSERVATIONS = 30
 FINEST = 0.02
 """Pixels: errors below are not taken for noise of the features, however exact a reconstruction is."""
 FARTHEST_MATCH = 0.02
-"""Share of a photo's width: where half of the points are farther than that from where photos show them, the photos are not
-those that were reconstructed."""
+"""Share of a photo's width: photos are others than the reconstructed ones where half of the points are farther from
+where photos show them."""
 PARAMETERS = 10
 DERIVATIVES = (
     ((0, 4, -1), (1, 0, 1), (1, 3, 1), (2, 2, -1), (3, 6, 1), (5, 7, -1), (6, 1, 1)),
     ((0, 0, -1), (0, 5, -1), (1, 4, 1), (2, 1, 1), (4, 6, 1), (5, 8, -1), (7, 2, 1)),
 )
-"""Derivatives of a pixel's x and y by parameters of `Pinholes.moved`: (parameter, function of `_Adjustment._camera_sums`,
-sign), in units of the focal length, and from function 6 on of the depth. Those by the principal point are left out."""
+"""Derivatives of a pixel's x and y by parameters of `Pinholes.moved` but the principal point: (parameter, function of
+`_Adjustment._camera_sums`, sign), in units of the focal length, and from function 6 on of the depth."""
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 """Rows and columns of the entries of a symmetric 3x3 matrix that are computed."""
 CHUNK = 30_000
@@ -73,7 +73,7 @@ class Pinholes:
 
     @classmethod
     def of(cls, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> Pinholes:
-        """The cameras of world-to-camera matrices [V, 4, 4], intrinsics [V, 3, 3] in pixels, and sizes [V, 2] (width, height)."""
+        """Cameras of viewmats [V, 4, 4], intrinsics [V, 3, 3] in pixels, and sizes [V, 2] (width, height)."""
         return cls(viewmats[:, :3, :3], viewmats[:, :3, 3], Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2], 0.5 * sizes[:, 0])
 
     def where(self, kept: np.ndarray, others: Pinholes) -> Pinholes:

@@ -12,7 +12,7 @@ from pathlib import Path
 from turbogs_plugin.captures import blender, llff
 from turbogs_plugin.captures.capture import Capture, named
 from turbogs_plugin.captures.colmap import INSTANT_NGP_FOLDERS, MODEL_FOLDERS, find_model, incomplete_model, read_colmap
-from turbogs_plugin.captures.photo_folder import find_photos, unread
+from turbogs_plugin.captures.photo_files import find_photos, unread
 from turbogs_plugin.captures.transforms import FILE, read_transforms
 from turbogs_plugin.errors import InputError
 

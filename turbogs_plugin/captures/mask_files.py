@@ -21,7 +21,7 @@ from turbogs_plugin.captures.decoding import (
     is_transparent,
     opened_image,
 )
-from turbogs_plugin.captures.photo_folder import MASKS, find_photos
+from turbogs_plugin.captures.photo_files import MASKS, find_photos
 from turbogs_plugin.captures.undistort import Lens
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import ViewMask
@@ -147,7 +147,7 @@ def _placed(keep: np.ndarray, lens: Lens | None, target: tuple[int, int]) -> np.
     """[H, W] bool: the mask after what is done to its photo."""
     if lens is not None:
         image = np.where(keep, np.uint8(255), np.uint8(0))[:, :, None]
-        keep = np.equal(lens.undistort(image, lens.size_of((keep.shape[1], keep.shape[0])))[:, :, 0], 255)
+        keep = np.asarray(lens.undistort(image, lens.size_of((keep.shape[1], keep.shape[0])))[:, :, 0] == 255)
     return _reduced(keep, target)
 
 

@@ -36,9 +36,8 @@ from turbogs_plugin.captures.colmap import (
     read_reconstruction,
     write_whole,
 )
-from turbogs_plugin.captures.load import camera_files
+from turbogs_plugin.captures.kinds import camera_files, capture_near
 from turbogs_plugin.captures.mask_files import FOLDER as MASKS
-from turbogs_plugin.captures.nearby import capture_near
 from turbogs_plugin.captures.photo_files import REDUCED
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable

@@ -17,8 +17,8 @@ from PIL.ExifTags import IFD, Base
 
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, check_photo_name
 from turbogs_plugin.captures.decoding import decoding_threads, opened_image, require_8_bits
-from turbogs_plugin.captures.nearby import capture_of_run
-from turbogs_plugin.captures.photo_folder import find_photos, unread
+from turbogs_plugin.captures.kinds import capture_of_run
+from turbogs_plugin.captures.photo_files import find_photos, unread
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import naming
 

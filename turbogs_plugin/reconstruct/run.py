@@ -14,7 +14,7 @@ import numpy as np
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, named
 from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.captures.mask_files import misnamed
-from turbogs_plugin.captures.photo_folder import find_photos, unread
+from turbogs_plugin.captures.photo_files import find_photos, unread
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct import solver
 from turbogs_plugin.reconstruct.agreement import (

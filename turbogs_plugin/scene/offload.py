@@ -231,7 +231,7 @@ class OffloadedPhotos(_Windowed, Photos):
         return self if torch.device(device) == self._window.device else OffloadedPhotos(self, device)
 
 
-class OffloadedErrorMaps(_Windowed, ErrorMaps):  # type: ignore[misc]  # `offsets` is the window's
+class OffloadedErrorMaps(_Windowed, ErrorMaps):  # type: ignore[override]  # `offsets` is the window's
     """Error maps in host memory, with a window on a device; `errors`, `stamps` and `offsets` are the window's."""
 
     @property
@@ -295,9 +295,10 @@ class _CopyStream:
         self.latest: list[torch.cuda.Event] = []
 
     def wait(self, events: Sequence[torch.cuda.Event]) -> None:
-        """Copies from now on come after these."""
-        for event in dict.fromkeys(events) if self._stream is not None else ():
-            self._stream.wait_event(event)
+        """Copies from now on come after these events."""
+        if self._stream is not None:
+            for event in dict.fromkeys(events):
+                self._stream.wait_event(event)
 
     def copy(self, target: Tensor, source: Tensor) -> None:
         if self._stream is None:

@@ -64,7 +64,7 @@ class PhotoOrder:
         there, order, found[~inside] = np.append(there, 0), np.append(order, 0), -1  # -1: the one appended
         inside &= self._folders[there[found]] == self._folders[here]
         lengths = np.where(inside, np.abs(there[found] - here), 0)
-        both = inside.all(axis=1, keepdims=True)
+        both = np.asarray(inside.all(axis=1, keepdims=True))
         weights = np.where(both, lengths[:, ::-1] / np.maximum(1, lengths.sum(axis=1, keepdims=True)), inside)
         rows = np.where(inside, order[found], 0)
         nearer = np.where(both[:, 0], lengths.min(axis=1), lengths.max(axis=1))
