@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 import tyro
 
+from turbogs_plugin.captures.demo import write_demo_capture
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.report.run_report import write_report
-from turbogs_plugin.scene.demo import write_demo_capture
 from turbogs_plugin.train import run
 
 CONFIGS = ("turbogs", "3dgs", "3dgs-as-shipped", "fastgs", "mcmc")

@@ -19,11 +19,12 @@ import tyro
 from gsplat import DefaultStrategy, rasterization
 from torch import Tensor
 
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.captures.demo import write_demo_capture
 from turbogs_plugin.engine import rendering
 from turbogs_plugin.gsplat_bridge import sparse_rasterization
 from turbogs_plugin.model.initial import gaussians_from_points
-from turbogs_plugin.scene import Scene, load_scene
-from turbogs_plugin.scene.demo import write_demo_capture
+from turbogs_plugin.scene import Scene
 from turbogs_plugin.types import Cameras, Gaussians
 
 LEARNING_RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}

@@ -17,9 +17,10 @@ from torch import Tensor
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.gsplat_bridge import gather_pixels
 from turbogs_plugin.report.provenance import provenance
-from turbogs_plugin.strategies import PixelSampler, SparseLoss
+from turbogs_plugin.strategies import SparseLoss
 from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
+from turbogs_plugin.strategies.protocols import PixelSampler
 from turbogs_plugin.types import PixelSamples, Step
 
 

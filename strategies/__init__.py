@@ -2,7 +2,8 @@
 
 Every protocol and every strategy can be imported from here; each is loaded when it is first used::
 
-    from turbogs_plugin.strategies import ErrorGuidedPixelSampler, PixelSampler
+    from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
+    from turbogs_plugin.strategies.protocols import PixelSampler
 """
 
 from __future__ import annotations

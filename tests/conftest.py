@@ -59,7 +59,7 @@ def plotted(request, monkeypatch) -> None:
 @pytest.fixture
 def few_random_points(monkeypatch) -> None:
     """Captures without points start from 500 random ones, not 50,000, which take longer than all else of a load."""
-    from turbogs_plugin.scene import llff, starting_points
+    from turbogs_plugin.captures import llff, starting_points
 
     for module in (starting_points, llff):
         monkeypatch.setattr(module, "NUM_RANDOM_POINTS", 500)

@@ -11,7 +11,7 @@ import torch
 
 import turbogs_plugin
 from turbogs_plugin import strategies
-from turbogs_plugin.scene import write_demo_capture
+from turbogs_plugin.captures.demo import write_demo_capture
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "architecture.md"

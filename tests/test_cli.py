@@ -15,7 +15,7 @@ import torch
 from helpers.framework_runs import TINY, stop_after
 from PIL import Image
 
-from turbogs_plugin import __version__, cli, scene
+from turbogs_plugin import __version__, captures, cli
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.export.renders import distinct_stems
 from turbogs_plugin.model.ply import load_ply
@@ -105,7 +105,7 @@ def panorama(capture: Path) -> None:
 def two_views(capture: Path) -> None:
     folder = capture.with_name("few")
     shutil.rmtree(capture)
-    from turbogs_plugin.scene import write_demo_capture
+    from turbogs_plugin.captures import write_demo_capture
 
     write_demo_capture(folder, views=3, width=32, height=32)
     model = model_of(folder)
@@ -227,10 +227,10 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
     ],
 )
 def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch, error, remedy):
-    def refused(path, horizon):
+    def refused(path):
         raise error
 
-    monkeypatch.setattr(scene, "write_demo_capture", refused)
+    monkeypatch.setattr(captures, "write_demo_capture", refused)
     words = [error.strerror, *filter(None, [error.filename]), remedy]
     assert_refused(turbogs("demo", tmp_path / "demo"), *words)
 
@@ -437,7 +437,7 @@ def test_depth_images_are_in_the_captures_own_units(turbogs, capture, finished):
     code, out, _ = turbogs("render", finished, "--depth", "--device", "cpu")
     folder = finished / "renders" / "test-depth"
     assert code == 0 and str(folder) in out
-    loaded, model = scene.load_scene(capture), load_ply(finished / "model.ply")
+    loaded, model = captures.load_scene(capture), load_ply(finished / "model.ply")
     cameras, frame = loaded.test.cameras, loaded.frame
     center = torch.from_numpy(frame.center).float()
     assert abs(frame.scale - 1) > 0.1  # or the units show nothing
@@ -499,13 +499,6 @@ def test_a_reader_that_stops_early_is_no_error():
     ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (141, "")
-
-
-def test_the_demo_has_a_horizon_where_it_is_asked_for(turbogs, tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(scene, "write_demo_capture", lambda path, horizon: asked.append(horizon) or path)
-    assert turbogs("demo", tmp_path / "in")[0] == turbogs("demo", tmp_path / "out", "--horizon")[0] == 0
-    assert asked == [False, True]
 
 
 def test_a_run_without_a_report_tells_its_model_and_both_clocks(turbogs, capture, tmp_path):

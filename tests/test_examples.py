@@ -19,11 +19,12 @@ import torch
 from helpers.framework_runs import thin_out_points
 from PIL import Image
 
+from turbogs_plugin.captures import load_scene, write_demo_capture
 from turbogs_plugin.config.components import build
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import Scene, load_scene, write_demo_capture
+from turbogs_plugin.scene import Scene
 from turbogs_plugin.train import run
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.types import PixelSamples, Step

@@ -74,4 +74,4 @@ def test_training_and_its_report_load_nothing_slow_before_they_use_it(loaded):
 
 
 def test_a_run_without_a_report_loads_nothing_slow_but_the_reader_of_its_capture(loaded):
-    assert loaded[2] & SLOW == {"pycolmap"}
+    assert loaded[2] & SLOW == {"pycolmap", "scipy"}

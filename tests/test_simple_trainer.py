@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from turbogs_plugin.captures import write_demo_capture
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import write_demo_capture
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "examples" / "simple_trainer"

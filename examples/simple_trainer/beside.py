@@ -22,7 +22,7 @@ import compare
 import tyro
 from packaging.utils import canonicalize_name
 
-from turbogs_plugin.scene import write_demo_capture
+from turbogs_plugin.captures import write_demo_capture
 
 
 @dataclass

@@ -22,11 +22,11 @@ from turbogs_plugin.bench.precision import precision
 from turbogs_plugin.bench.raster import STAGES, RasterBench, stages_recorded
 from turbogs_plugin.bench.recorder import STEPS, Recorder, recorded
 from turbogs_plugin.bench.step import tensor_bytes
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.cuda import library
 from turbogs_plugin.engine.rendering import rasterize
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import load_scene
-from turbogs_plugin.scene.poses import evenly
+from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")

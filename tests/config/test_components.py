@@ -15,7 +15,7 @@ from turbogs_plugin.strategies import TYPES
 
 MODULE = """
 from dataclasses import dataclass
-from turbogs_plugin.strategies import DensityController
+from turbogs_plugin.strategies.protocols import DensityController
 
 @dataclass
 class MySampler:

@@ -17,6 +17,7 @@ from helpers.processes import ended, grouped, said, start_ranks
 from PIL import Image
 from torch import Tensor
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed.digest import digest
 from turbogs_plugin.distributed.exchange import owners_pay
@@ -24,7 +25,6 @@ from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, Ranks
 from turbogs_plugin.distributed.rows import rows_of
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.torch_file import leaves
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer

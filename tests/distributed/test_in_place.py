@@ -13,6 +13,7 @@ from helpers.models import random_gaussians
 from helpers.peer_files import KeepingEngine, PeerFiles
 from helpers.processes import ended, grouped, said, start_ranks
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.distributed import in_place, peer_memory, shared_model
 from turbogs_plugin.distributed.in_place import DRAWN, FREE, STEPPED, WRITTEN, InPlace
@@ -25,7 +26,6 @@ from turbogs_plugin.engine.protocol import ModelCopies
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.rendered import ScreenRecords
 from turbogs_plugin.model.torch_file import leaves
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 

@@ -11,7 +11,7 @@ import torch
 from turbogs_plugin.distributed.shares import NEARLY, shares_of
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.masks import PixelMasks
-from turbogs_plugin.strategies import ErrorGuidedPixelSampler
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import PixelSamples, Step
 

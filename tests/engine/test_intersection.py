@@ -7,7 +7,8 @@ from helpers.rendering_scenes import dense_on_grid, make_cameras, make_gaussians
 
 from turbogs_plugin.engine.reference.intersection import intersect_tiles, smallest_exponents, spread
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
-from turbogs_plugin.engine.rendering import RasterSettings, dense_samples
+from turbogs_plugin.engine.rendered import RasterSettings
+from turbogs_plugin.engine.rendering import dense_samples
 
 SETTINGS = RasterSettings()
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_config
 
-from turbogs_plugin.scene import load_scene
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.train import run
 from turbogs_plugin.train.saved_model import load_model
 

@@ -16,7 +16,7 @@ from turbogs_plugin.export.camera_path import (
     through_views,
 )
 from turbogs_plugin.scene import Frame
-from turbogs_plugin.scene.poses import camera_centers, look_at
+from turbogs_plugin.scene.geometry import camera_centers, look_at
 from turbogs_plugin.types import Cameras
 
 K = np.array([[50.0, 0, 24], [0, 50.0, 20], [0, 0, 1]])

@@ -13,11 +13,11 @@ from helpers.refusals import assert_refused
 from helpers.tracked import HEIGHT, WIDTH, tracked, write_tracked
 from PIL import Image
 
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.captures.bundle_adjustment import Pinholes
+from turbogs_plugin.captures.camera_refinement import refine_cameras
 from turbogs_plugin.export import refined_capture
 from turbogs_plugin.export.refined_capture import write_refined
-from turbogs_plugin.scene import load_scene
-from turbogs_plugin.scene.bundle_adjustment import Pinholes
-from turbogs_plugin.scene.camera_refinement import refine_cameras
 
 NOISE = 0.1
 CASE = tracked(views=6, points=80, noise=NOISE)

@@ -11,8 +11,8 @@ from helpers.framework_runs import tiny_capture
 from turbogs_plugin.bench.commands import AGAIN
 from turbogs_plugin.bench.raster import STAGES, RasterBench
 from turbogs_plugin.bench.step import StepBench
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.cuda import library as kernels
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.study.cell import scene_on
 
 pytestmark = [

@@ -15,11 +15,11 @@ from gsplat import DefaultStrategy, MCMCStrategy, rasterization
 from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
 from helpers.raster_cases import GPU_ONLY
 
+from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.engine.rendering import dense_samples
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_loss, sparse_rasterization
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, loss_shares
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer

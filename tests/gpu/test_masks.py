@@ -17,16 +17,19 @@ from helpers.raster_cases import (
 )
 from PIL import Image
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda import training as training_kernels
 from turbogs_plugin.engine.protocol import MapUpdate
-from turbogs_plugin.engine.reference.draws import DrawRule, draw_pixels
+from turbogs_plugin.engine.reference.draws import draw_pixels
 from turbogs_plugin.engine.reference.losses import sparse_loss
-from turbogs_plugin.engine.rendering import RenderOptions, rasterize, rasterize_reference
+from turbogs_plugin.engine.reference.raster import rasterize_reference
+from turbogs_plugin.engine.rendered import RenderOptions
+from turbogs_plugin.engine.rendering import rasterize
+from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.masks import PixelMasks
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.train.loop import TrainingLoop

@@ -16,6 +16,7 @@ import torch
 from PIL import Image
 
 from turbogs_plugin.bench.large_capture import synthetic_scene
+from turbogs_plugin.captures import write_demo_capture
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed.digest import digest
 from turbogs_plugin.distributed.processes import start
@@ -23,7 +24,6 @@ from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.rendered import RenderOptions, ScreenRecords
 from turbogs_plugin.errors import TrainingStopped
-from turbogs_plugin.scene import write_demo_capture
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.trainer import Trainer
 

@@ -13,7 +13,8 @@ from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.projection import SPAN_MAX
-from turbogs_plugin.engine.rendering import RenderOptions, rasterize_reference
+from turbogs_plugin.engine.reference.raster import rasterize_reference
+from turbogs_plugin.engine.rendered import RenderOptions
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras
 

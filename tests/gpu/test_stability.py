@@ -12,8 +12,8 @@ from helpers.raster_cases import FORWARD_BOUND, GPU_ONLY, GRADIENT_BOUND
 from helpers.raster_extremes import CASES, NAMES, TWO_VIEWS, assert_within, compare, random_scene, render
 from helpers.tolerances import TOLERANCES
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.rendering import dense_samples, rasterize
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.train.run import train
 from turbogs_plugin.train.saved_model import load_model

@@ -6,8 +6,9 @@ import torch
 
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.cuda import training as training_kernels
-from turbogs_plugin.engine.reference.draws import WEIGHT_FLOOR, DrawRule, draw_pixels
+from turbogs_plugin.engine.reference.draws import WEIGHT_FLOOR, draw_pixels
 from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, exponentials, random_words
+from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.types import Step
 

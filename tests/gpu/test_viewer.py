@@ -5,10 +5,10 @@ import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_config
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.plan import make_plan
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.types import RowUpdate

@@ -18,7 +18,7 @@ from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, m
 from turbogs_plugin.engine.rendering import dense_samples
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_rasterization
-from turbogs_plugin.strategies import MomentLMOptimizer
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
 DROP_IN = Path(__file__).resolve().parents[2] / "docs" / "drop-in.md"
 OURS = {"features_dc": "sh0", "features_rest": "shN"}

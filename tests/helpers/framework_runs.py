@@ -10,9 +10,9 @@ from tempfile import TemporaryDirectory
 import pytest
 import torch
 
+from turbogs_plugin.captures import write_demo_capture
+from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.config.configuration import Config, load_config
-from turbogs_plugin.scene import write_demo_capture
-from turbogs_plugin.scene.colmap import load_pycolmap
 from turbogs_plugin.train.trainer import Trainer
 
 TINY = (

@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed.exchange import RankExchange
 from turbogs_plugin.distributed.in_place import InPlace
@@ -23,7 +24,6 @@ from turbogs_plugin.distributed.shared_pass import SharedScreen
 from turbogs_plugin.engine.cuda import workspace
 from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.rendered import ScreenRecords
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians

@@ -9,8 +9,8 @@ import numpy as np
 import pycolmap
 from PIL import Image
 
-from turbogs_plugin.scene.bundle_adjustment import Pinholes
-from turbogs_plugin.scene.observations import Observations
+from turbogs_plugin.captures.bundle_adjustment import Pinholes
+from turbogs_plugin.scene.scene import Observations
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 560.0
 

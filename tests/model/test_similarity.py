@@ -9,7 +9,7 @@ from helpers.models import random_gaussians
 
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.model.similarity import Similarity
-from turbogs_plugin.scene.poses import look_at
+from turbogs_plugin.scene.geometry import look_at
 from turbogs_plugin.types import Cameras
 
 AXIS_ANGLES = [(0.3, -1.2, 2.1), (math.pi, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, math.pi / 2, 0.0)]

@@ -8,6 +8,7 @@ import pytest
 import torch
 from helpers.framework_runs import TINY, stop_after, tiny_config
 
+from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.config.configuration import apply_overrides, config_names, load_config, resolve
 from turbogs_plugin.config.sections import AUTO_SETTINGS
 from turbogs_plugin.errors import InputError
@@ -15,7 +16,6 @@ from turbogs_plugin.plan import Plan, SceneFacts
 from turbogs_plugin.plan.decisions import RULES
 from turbogs_plugin.plan.plan import plan_from_facts
 from turbogs_plugin.report.run_report import write_report
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.study.results import StudyFolder
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer

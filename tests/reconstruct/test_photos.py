@@ -7,10 +7,10 @@ import pytest
 from helpers.refusals import assert_refused
 from PIL import Image
 
+from turbogs_plugin.captures.decoding import load_photos, photo_array, photo_sizes
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct import solver
 from turbogs_plugin.reconstruct.photos import place_photos, read_photos
-from turbogs_plugin.scene.photos import load_photos, photo_array, photo_sizes
 
 TURNS = {1: None, 3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}
 """How an upright picture is stored for each orientation."""

@@ -10,12 +10,12 @@ from helpers.refusals import assert_refused
 from helpers.textured_corner import camera_centers, render_corner, write_photos
 from PIL import Image
 
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.captures.kinds import holds_photos_alone
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct import Solution, reconstruct, run, scene_beside, solver
 from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups
 from turbogs_plugin.reconstruct.photos import read_photos
-from turbogs_plugin.scene import load_scene
-from turbogs_plugin.scene.load import holds_photos_alone
 
 COUNT = 7
 

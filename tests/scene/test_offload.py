@@ -9,10 +9,11 @@ import pytest
 import torch
 from helpers.framework_runs import assert_identical, tiny_config
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.export.renders import render_run
 from turbogs_plugin.report.evaluation import evaluate_run
-from turbogs_plugin.scene import Scene, load_scene, offload
+from turbogs_plugin.scene import Scene, offload
 from turbogs_plugin.scene.offload import ABSENT, OffloadedErrorMaps, OffloadedPhotos, ViewWindow
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
@@ -80,16 +81,6 @@ def test_a_run_stops_with_resident_maps_and_goes_on_with_offloaded_ones(scene, c
     assert_identical(whole.state_dict(), second.state_dict())
 
 
-def test_a_whole_run_leaves_the_same_model(capture, tmp_path):
-    models = []
-    for place in ("device", "host"):
-        config = tiny_config(capture, f"train.maps_place={place}", f"train.photos_place={place}")
-        outcome = run.train(config, tmp_path / place)
-        assert outcome.folder.read_config().train.maps_place == place
-        models.append(outcome.folder.model.read_bytes())
-    assert models[0] == models[1]
-
-
 @pytest.mark.parametrize("place", ["device", "host"])
 def test_photos_stay_in_host_memory_when_a_run_is_looked_at(capture, tmp_path, monkeypatch, place):
     """Evaluated, where it was planned so, with the same errors; rendered, always."""
@@ -102,11 +93,6 @@ def test_photos_stay_in_host_memory_when_a_run_is_looked_at(capture, tmp_path, m
     assert moved == ([] if place == "host" else [CPU])
     render_run(tmp_path / "run", "train", "cpu")
     assert len(moved) == (place == "device")
-
-
-def test_the_initial_colour_is_that_of_the_photos(scene, capture):
-    sh0 = [trainer_of(scene, capture, False, photos).gaussians.sh0 for photos in (False, True)]
-    assert torch.equal(*sh0)
 
 
 def test_maps_of_both_kinds_say_the_same():

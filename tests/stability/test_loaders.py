@@ -18,10 +18,11 @@ from helpers.framework_runs import tiny_config
 from helpers.models import random_gaussians
 from PIL import Image
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.gsplat_file import save_gsplat
-from turbogs_plugin.scene import Frame, load_scene
+from turbogs_plugin.scene import Frame
 from turbogs_plugin.train import inputs, run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from turbogs_plugin.train.given_model import load_given

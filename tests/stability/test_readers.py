@@ -19,10 +19,11 @@ from helpers.framework_runs import tiny_config
 from helpers.models import random_gaussians
 from PIL import Image
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.gsplat_file import save_gsplat
 from turbogs_plugin.model.ply import save_ply
-from turbogs_plugin.scene import Frame, Scene, load_scene
+from turbogs_plugin.scene import Frame, Scene
 from turbogs_plugin.train.initial_state import initial_gaussians
 from turbogs_plugin.types import Gaussians
 
@@ -111,27 +112,6 @@ def test_other_values_in_files_of_frames(photos, kind):
         if not isinstance(result, InputError):
             require_whole(result)
     assert 60 < refused < 150
-
-
-@pytest.mark.usefixtures("few_random_points")
-def test_other_values_in_a_table_of_llff(photos):
-    rows = [
-        [*np.c_[np.array(pose(view))[:3, [1, 0, 2, 3]] * [-1, 1, 1, 1], [12, 16, 14]].ravel(), 1, 9]
-        for view in range(5)
-    ]
-    choice, refused = random.Random("llff"), 0
-    for _ in range(300):
-        table = np.array(rows, dtype=choice.choice([np.float64, np.float32]))
-        with np.errstate(over="ignore"):
-            for _ in range(choice.choice([1, 1, 3])):
-                place = choice.randrange(5), choice.randrange(17)
-                table[place] = choice.choice([*NUMBERS, table[place] * choice.choice([1.001, -1, 1e6, 1e-6])])
-        np.save(photos / "poses_bounds.npy", table)
-        result = outcome_within(MEMORY, load_scene, photos)
-        refused += isinstance(result, InputError)
-        if not isinstance(result, InputError):
-            require_whole(result)
-    assert 100 < refused < 300
 
 
 # ---- Models to start from ----------------------------------------------------------------------------------------

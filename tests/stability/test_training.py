@@ -16,10 +16,10 @@ from helpers.tolerances import PSNR_BOUND
 from PIL import Image
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.report.run_report import write_report
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint

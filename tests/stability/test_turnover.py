@@ -17,8 +17,9 @@ from helpers.squares import SQUARES
 from torch import Tensor
 
 from turbogs_plugin.bench.large_capture import synthetic_scene
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import Config, load_config
-from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import SH_C0, RowUpdate

@@ -7,8 +7,9 @@ import pytest
 import torch
 from helpers.sampling_cases import SIGMAS, UNITS, random_maps, step
 
-from turbogs_plugin.engine.reference.draws import DrawRule, Units, draw_units
+from turbogs_plugin.engine.reference.draws import Units, draw_units
 from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, random_words
+from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler, RandomPixelSampler
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 from helpers.sampling_cases import SIGMAS, SIZES, UNITS, pixels_by_tile, random_maps, step
 
-from turbogs_plugin.engine.reference.draws import DrawRule
 from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, exponentials, random_words
+from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler

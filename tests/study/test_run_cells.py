@@ -15,10 +15,11 @@ from helpers.processes import PRELOADED
 from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin import cli
+from turbogs_plugin.captures.demo import write_demo_capture
+from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.plan.decisions import RULES, Verdict
 from turbogs_plugin.report.provenance import provenance
-from turbogs_plugin.scene import load_scene, write_demo_capture
 from turbogs_plugin.study import cell as cell_module
 from turbogs_plugin.study import run_cells
 from turbogs_plugin.study.cell import capture_digest, train_cell

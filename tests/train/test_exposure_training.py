@@ -10,11 +10,11 @@ import torch
 from helpers.framework_runs import assert_identical, stop_after, tiny_capture, tiny_config
 from PIL import Image
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.export.renders import render_run
 from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.report.run_report import write_report
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.metrics import align_colors, compare, evaluate, render_view

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.run import fit
 
 SHORT = ("train.iterations=2", "train.refine_until=1", "train.device=cpu")

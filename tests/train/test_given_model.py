@@ -13,14 +13,14 @@ from helpers.framework_runs import tiny_config
 from helpers.models import random_gaussians
 from PIL import Image
 
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.captures.colmap import load_pycolmap
+from turbogs_plugin.captures.starting_points import random_points
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.gsplat_world import gsplat_worlds
 from turbogs_plugin.model.ply import read_ply
 from turbogs_plugin.plan.decisions import wanted_backdrop
-from turbogs_plugin.scene import load_scene
-from turbogs_plugin.scene.colmap import load_pycolmap
-from turbogs_plugin.scene.starting_points import random_points
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.given_model import load_given

@@ -8,7 +8,7 @@ import torch
 from helpers.simulated_time import SimulatedTime
 
 import turbogs_plugin.train
-from turbogs_plugin.config.configuration import TrainConfig
+from turbogs_plugin.config.sections import TrainConfig
 from turbogs_plugin.distributed.ranks import ONE
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.pace import IterationPace

@@ -8,8 +8,8 @@ import pytest
 import torch
 from helpers.framework_runs import assert_identical, stop_after, tiny_capture, tiny_config
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.parameter_mean import AVERAGE_EVERY, ParameterMean
 from turbogs_plugin.train.run import fit, resume, train

@@ -9,11 +9,11 @@ import pytest
 import torch
 from helpers.framework_runs import TINY, tiny_capture, tiny_config
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.doctor import diagnosis
 from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.report.provenance import provenance
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.study.cell import train_cell
 from turbogs_plugin.train import perceptual, run
 from turbogs_plugin.train.perceptual import load_flip

@@ -12,10 +12,11 @@ import torch
 from helpers.framework_runs import stop_after, tiny_config
 from helpers.simulated_time import SimulatedTime
 
-from turbogs_plugin.config.configuration import TrainConfig, resolve
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.config.configuration import resolve
 from turbogs_plugin.config.scaling import with_iterations
+from turbogs_plugin.config.sections import TrainConfig
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train import pace as pacing
 from turbogs_plugin.train import run, session
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like

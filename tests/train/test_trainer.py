@@ -21,13 +21,13 @@ from helpers.framework_runs import TINY, assert_identical, stop_after, tiny_capt
 from helpers.processes import PRELOADED, ended
 from PIL import Image
 
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.captures.fingerprint import capture_difference, capture_state
 from turbogs_plugin.config.configuration import Config, load_config, resolve
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.report.run_report import write_report
-from turbogs_plugin.scene import load_scene
-from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import read_history

@@ -7,8 +7,8 @@ from contextlib import closing, contextmanager
 import pytest
 from helpers.framework_runs import tiny_capture, tiny_config
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.plan import make_plan
-from turbogs_plugin.scene import load_scene
 from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.viewer.model_state import CaptureViews, ModelState
 

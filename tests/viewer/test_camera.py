@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers.framework_runs import tiny_capture
 
-from turbogs_plugin.scene import load_scene
+from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.viewer.camera import FOV_LIMITS, LARGEST_SIDE, SMALLEST_SIDE, ViewerCamera
 
 GOOD = {"position": (1.0, 2.0, 3.0), "wxyz": (2.0, 0.0, 0.0, 0.0), "fov": 1.0, "width": 640, "height": 480}

@@ -23,14 +23,14 @@ from turbogs_plugin.bench.statistics import bench_statistics, statistics_table
 from turbogs_plugin.bench.step import StepBench
 from turbogs_plugin.bench.viewer import bench_viewer, viewer_lines
 from turbogs_plugin.bench.wall import bench_wall, wall_lines
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.engine.cuda.library import LIBRARY_VARIABLE, require
 from turbogs_plugin.errors import InputError, exit_code
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.report.provenance import missing_bytecode, provenance
-from turbogs_plugin.scene import load_scene
-from turbogs_plugin.scene.capture import FEWEST_PHOTOS
 from turbogs_plugin.study.cell import scene_on
 from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.viewer.server import require_server

@@ -15,7 +15,7 @@ from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.poses import look_at
+from turbogs_plugin.scene.geometry import look_at
 from turbogs_plugin.tiles import TILE_PIXELS, compact, pixel_table
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer

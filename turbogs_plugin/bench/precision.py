@@ -7,7 +7,8 @@ from torch import Tensor
 
 from turbogs_plugin.bench.models import ring_cameras, surface_gaussians, tile_samples
 from turbogs_plugin.engine.layout import ScreenRecord, columns
-from turbogs_plugin.engine.rendering import rasterize, rasterize_reference
+from turbogs_plugin.engine.reference.raster import rasterize_reference
+from turbogs_plugin.engine.rendering import rasterize
 
 COLUMNS = ("mean", "conic", "color", "opacity")
 """The columns that the records of screen gradients have in every pass."""

@@ -21,6 +21,7 @@ from turbogs_plugin.bench.clocks import back_to_back, device_times
 from turbogs_plugin.bench.models import trained_model
 from turbogs_plugin.bench.recorder import Recorder
 from turbogs_plugin.bench.step import StepBench, warm_trainer
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.exchange import RankExchange
 from turbogs_plugin.distributed.in_place import InPlace
@@ -29,7 +30,7 @@ from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
 from turbogs_plugin.distributed.rows import OwnedRows
 from turbogs_plugin.distributed.shared_pass import SharedScreen
 from turbogs_plugin.errors import TrainingStopped
-from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.scene import Scene
 from turbogs_plugin.study.cell import scene_on
 from turbogs_plugin.train.inputs import resolve_device
 from turbogs_plugin.train.trainer import Trainer

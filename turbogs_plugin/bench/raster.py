@@ -30,7 +30,7 @@ from turbogs_plugin.engine.cuda.raster import CudaRendered
 from turbogs_plugin.engine.rendered import Rendered
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.poses import evenly
+from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.study.cell import scene_on
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats
 

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.bench.models import ring_cameras, surface_gaussians, tile_samples
-from turbogs_plugin.engine.rendering import rasterize, rasterize_reference
+from turbogs_plugin.engine.reference.raster import rasterize_reference
+from turbogs_plugin.engine.rendering import rasterize
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.report.provenance import hardware, software
 from turbogs_plugin.report.tables import table

@@ -21,14 +21,13 @@ def reconstruct(photos: Annotated[Positional[Path], arg(metavar="PHOTOS")], /, *
     return 0
 
 
-def demo(path: Positional[Path], /, horizon: bool = False) -> int:
+def demo(path: Positional[Path], /) -> int:
     """Write a small synthetic capture to try things on: a textured scene as a COLMAP dataset.
 
     Args:
         path: new folder.
-        horizon: a scene outdoors, seen as far as the sky.
     """
-    from turbogs_plugin.scene import write_demo_capture
+    from turbogs_plugin.captures import write_demo_capture
 
-    print(f"capture  {write_demo_capture(path, horizon=horizon)}")
+    print(f"capture  {write_demo_capture(path)}")
     return 0

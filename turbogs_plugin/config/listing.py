@@ -9,9 +9,10 @@ from dataclasses import is_dataclass
 from textwrap import fill
 from typing import Any, get_type_hints
 
-from turbogs_plugin.config.components import KINDS, TYPES, strategy_class
+from turbogs_plugin.config.components import KINDS, strategy_class
 from turbogs_plugin.config.configuration import SECTION_CLASSES, Config
 from turbogs_plugin.config.typed import settings_of
+from turbogs_plugin.strategies import TYPES
 
 WIDTH = 120
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from turbogs_plugin.captures.camera_json import number_of, opengl_viewmat, pinhole, read_frames
+from turbogs_plugin.captures.capture import LARGEST_SIDE
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.capture import LARGEST_SIDE
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.poses import camera_centers, evenly, look_at
-from turbogs_plugin.scene.transforms import number_of, opengl_viewmat, pinhole, read_frames
+from turbogs_plugin.scene.geometry import camera_centers, evenly, look_at
 from turbogs_plugin.types import Cameras
 
 MOST_KEYS = 24

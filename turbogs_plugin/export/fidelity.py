@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from turbogs_plugin.scene import PosedImages
-from turbogs_plugin.scene.poses import evenly
+from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.metrics import psnr, render_view
 from turbogs_plugin.types import Gaussians

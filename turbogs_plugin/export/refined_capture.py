@@ -16,9 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import require_writable
-from turbogs_plugin.scene.bundle_adjustment import (
+from turbogs_plugin.captures.bundle_adjustment import (
     FARTHEST_MATCH,
     Pinholes,
     Refinement,
@@ -26,12 +24,13 @@ from turbogs_plugin.scene.bundle_adjustment import (
     of_these_photos,
     refine_together,
 )
-from turbogs_plugin.scene.capture import LARGEST_SIDE, Capture, named
-from turbogs_plugin.scene.colmap import load_pycolmap, read_colmap, read_reconstruction
-from turbogs_plugin.scene.colmap_check import write_whole
-from turbogs_plugin.scene.load import camera_files
-from turbogs_plugin.scene.mask_files import FOLDER as MASKS
-from turbogs_plugin.scene.observations import Observations
+from turbogs_plugin.captures.capture import LARGEST_SIDE, Capture, named
+from turbogs_plugin.captures.colmap import load_pycolmap, read_colmap, read_reconstruction, write_whole
+from turbogs_plugin.captures.kinds import camera_files
+from turbogs_plugin.captures.mask_files import FOLDER as MASKS
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import require_writable
+from turbogs_plugin.scene.scene import Observations
 
 if TYPE_CHECKING:
     import pycolmap

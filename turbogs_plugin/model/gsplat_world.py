@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from turbogs_plugin.model.similarity import Similarity
-from turbogs_plugin.scene.poses import camera_centers
+from turbogs_plugin.scene.geometry import camera_centers
 from turbogs_plugin.types import SH_C0, Gaussians
 
 HALF_TURNS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.nearest import mean_neighbor_distances
+from turbogs_plugin.scene.geometry import mean_neighbor_distances
 from turbogs_plugin.types import SH_C0, Gaussians
 
 INITIAL_OPACITY = 0.1

@@ -14,7 +14,7 @@ from torch import Tensor
 from turbogs_plugin.engine.reference.spherical_harmonics import basis, num_bands
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.poses import quaternions
+from turbogs_plugin.scene.geometry import quaternions
 from turbogs_plugin.types import Gaussians
 
 SAMPLED_DIRECTIONS = 64

@@ -11,10 +11,10 @@ from pathlib import Path
 from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 
+from turbogs_plugin.captures.decoding import decoding_threads, opened_image
+from turbogs_plugin.captures.mask_files import FOLDER, in_folders, require_mask_size
 from turbogs_plugin.files import read_text, write_text_atomically
 from turbogs_plugin.reconstruct.photos import PhotoFile, link_or_copy, plain_name
-from turbogs_plugin.scene.mask_files import FOLDER, in_folders, require_mask_size
-from turbogs_plugin.scene.photos import decoding_threads, opened_image
 
 
 @dataclass(frozen=True)

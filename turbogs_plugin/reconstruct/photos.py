@@ -14,12 +14,12 @@ from typing import Any
 from PIL import ImageOps
 from PIL.ExifTags import IFD, Base
 
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, check_photo_name
+from turbogs_plugin.captures.decoding import decoding_threads, opened_image, require_8_bits
+from turbogs_plugin.captures.kinds import capture_of_run
+from turbogs_plugin.captures.photo_files import find_photos, unread
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import naming
-from turbogs_plugin.scene.capture import FEWEST_PHOTOS, check_photo_name
-from turbogs_plugin.scene.nearby import capture_of_run
-from turbogs_plugin.scene.photo_folder import find_photos, unread
-from turbogs_plugin.scene.photos import decoding_threads, opened_image, require_8_bits
 
 SEPARATORS = re.compile(r"[\s#]")
 FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "BMP")

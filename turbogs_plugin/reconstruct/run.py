@@ -14,6 +14,11 @@ from typing import TYPE_CHECKING
 
 from filelock import FileLock, Timeout
 
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, named
+from turbogs_plugin.captures.colmap import load_pycolmap
+from turbogs_plugin.captures.decoding import photo_sizes, reduced_sizes
+from turbogs_plugin.captures.mask_files import misnamed
+from turbogs_plugin.captures.photo_files import find_photos, unread
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable, write_text_atomically
@@ -27,11 +32,6 @@ from turbogs_plugin.reconstruct.agreement import (
 from turbogs_plugin.reconstruct.masks import find_photo_masks, place_masks
 from turbogs_plugin.reconstruct.matching import FEW, choose_pairs
 from turbogs_plugin.reconstruct.photos import PhotoFile, list_photos, place_photos, read_photos
-from turbogs_plugin.scene.capture import FEWEST_PHOTOS, named
-from turbogs_plugin.scene.colmap import load_pycolmap
-from turbogs_plugin.scene.mask_files import misnamed
-from turbogs_plugin.scene.photo_folder import find_photos, unread
-from turbogs_plugin.scene.photos import photo_sizes, reduced_sizes
 
 if TYPE_CHECKING:
     import pycolmap

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.reconstruct.agreement import Agreement
 from turbogs_plugin.reconstruct.photos import PhotoFile
-from turbogs_plugin.scene.colmap import load_pycolmap
 
 if TYPE_CHECKING:
     import pycolmap

@@ -62,7 +62,7 @@ class Frame:
         return np.asarray(points, dtype=np.float64) * self.scale + self.center
 
     def normalise_poses(self, viewmats: np.ndarray) -> np.ndarray:
-        """[V, 4, 4] float64 world-to-camera matrices of the capture -> those of the normalised frame.
+        """[V, 4, 4] float64 world-to-camera matrices of the capture -> matrices of the normalised frame.
 
         Camera coordinates shrink with the world, so rotations stay rotations and no projection changes.
         """

@@ -24,7 +24,7 @@ MEMORY_SHARE = 0.5
 DISK_SHARE = 0.95
 """A file takes at most this share of what is free on its disk."""
 MADV_WILLNEED = 3
-"""Of ``madvise(2)`` on Linux."""
+"""Advice of ``madvise(2)`` on Linux: read ahead."""
 LARGE_FILES = Path("/var/tmp")
 """Where large temporary files belong: /tmp often lies in memory."""
 
@@ -50,7 +50,7 @@ def host_array(shape: Sequence[int], dtype: torch.dtype, what: str) -> Tensor:
 
 
 def too_large(size: int) -> bool:
-    """Whether so many bytes are more than one array may take of the memory now."""
+    """Whether an array of this many bytes takes more than `MEMORY_SHARE` of the memory that is free now."""
     return size > MEMORY_SHARE * free_host_bytes()
 
 

@@ -11,7 +11,7 @@ still works on the iteration before, whose changed maps are copied out while the
 - copy out: after the work that changed the slot, as soon as the next views are asked for;
 - work on a slot: after its view has been copied in.
 
-The results are bit for bit those of maps and photos on the device.
+The results equal, bit for bit, results with maps and photos on the device.
 
 What does not fit in host memory either lies in a file (`scene/host_arrays.py`): the disk reads the views of an
 iteration all at once, and the host waits for them.
@@ -44,7 +44,7 @@ ABSENT = np.iinfo(np.int64).min // 2
 
 
 class ViewWindow:
-    """Arrays over the pixels of V views in host memory, and on a device those of the views in use.
+    """Arrays over the pixels of V views in host memory, and on a device the pixels of the views in use.
 
     Args:
         stores: arrays of one length [X, ...] in host memory. They are page-locked where they lie while the window
@@ -65,6 +65,8 @@ class ViewWindow:
         self._stores = tuple(stores)
         self._starts = pixel_offsets(sizes)  # [V + 1]
         self._slot_pixels = int(sizes.prod(axis=1).max())
+        self._used: set[int] = set()
+        self._arrays: tuple[Tensor, ...] = ()
         self._inward, self._outward = _CopyStream(self.device), _CopyStream(self.device)
         self._allocate(SETS)
         if self.device.type == "cuda":
@@ -143,7 +145,7 @@ class ViewWindow:
         self._slot_of: dict[int, int] = {}  # of the views in the window, the latest in use last
         self._free = list(reversed(range(slots)))
         self._released = [_mark(self.device)] * slots  # of each slot: the end of the work that used it
-        self._used: set[int] = set()
+        self._used = set()
         self._changed: set[int] = set()
         self._arriving: list[torch.cuda.Event] = []
 
@@ -221,31 +223,31 @@ class OffloadedPhotos(_Windowed, Photos):
         return self._stored
 
     @property
-    def colors(self) -> Tensor:
+    def colors(self) -> Tensor:  # type: ignore[override]  # read-only: the window's
         return self._window.arrays[0][:-1]
 
     def to(self, device: torch.device | str) -> OffloadedPhotos:
-        """The same photos, with a window on that device."""
+        """These photos, with a window on that device."""
         return self if torch.device(device) == self._window.device else OffloadedPhotos(self, device)
 
 
-class OffloadedErrorMaps(_Windowed, ErrorMaps):
+class OffloadedErrorMaps(_Windowed, ErrorMaps):  # type: ignore[override]  # `offsets` is the window's
     """Error maps in host memory, with a window on a device; `errors`, `stamps` and `offsets` are the window's."""
 
     @property
-    def errors(self) -> Tensor:
+    def errors(self) -> Tensor:  # type: ignore[override]  # read-only: the window's
         return self._errors[:-1]
 
     @property
-    def stamps(self) -> Tensor:
+    def stamps(self) -> Tensor:  # type: ignore[override]  # read-only: the window's
         return self._stamps[:-1]
 
     @property
-    def _errors(self) -> Tensor:
+    def _errors(self) -> Tensor:  # type: ignore[override]
         return self._window.arrays[0]
 
     @property
-    def _stamps(self) -> Tensor:
+    def _stamps(self) -> Tensor:  # type: ignore[override]
         return self._window.arrays[1]
 
     def _allocate(self) -> None:
@@ -276,7 +278,7 @@ def place_views(views: PosedImages, device: torch.device, place: str) -> PosedIm
 def place_maps(
     sizes: np.ndarray, device: torch.device, place: str, beta: float, masks: PixelMasks | None = None
 ) -> ErrorMaps:
-    """New maps on the device or, for ``host``, in host memory with a window. Arguments as those of `ErrorMaps`. Masks
+    """New maps on the device or, for ``host``, in host memory with a window. Arguments as for `ErrorMaps`. Masks
     are small, and always on the device."""
     return (OffloadedErrorMaps if place == "host" else ErrorMaps)(sizes, device, beta=beta, masks=masks)
 
@@ -293,9 +295,10 @@ class _CopyStream:
         self.latest: list[torch.cuda.Event] = []
 
     def wait(self, events: Sequence[torch.cuda.Event]) -> None:
-        """Copies from now on come after these."""
-        for event in dict.fromkeys(events):
-            self._stream.wait_event(event)
+        """Copies from now on come after these events."""
+        if self._stream is not None:
+            for event in dict.fromkeys(events):
+                self._stream.wait_event(event)
 
     def copy(self, target: Tensor, source: Tensor) -> None:
         if self._stream is None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Of each of W photos, the known ones that were taken before and after it.
+    """The known photos that were taken before and after each of W photos.
 
     Args:
         rows: [W, 2] int64, which of the known photos.
@@ -48,7 +48,7 @@ class PhotoOrder:
         self._folders = np.unique([_folder(name) for name in ordered], return_inverse=True)[1]  # of each place
 
     def neighbours(self, known: Sequence[str], photos: Sequence[str], apart: int = 1) -> Neighbours:
-        """The nearest known photos at least so many photos before and after each photo, which is none of its own.
+        """The nearest known photos, at least `apart` photos before and after each photo; none is its own neighbour.
 
         Args:
             known: names of the photos of which something is known.
@@ -60,11 +60,11 @@ class PhotoOrder:
         there = there[order]
         before = np.searchsorted(there, here - apart, side="right") - 1
         found = np.concatenate([before, np.searchsorted(there, here + apart)], axis=1)  # [W, 2]
-        inside = (found >= 0) & (found < len(there))
+        inside: NDArray[np.bool_] = np.logical_and(found >= 0, found < len(there))
         there, order, found[~inside] = np.append(there, 0), np.append(order, 0), -1  # -1: the one appended
         inside &= self._folders[there[found]] == self._folders[here]
         lengths = np.where(inside, np.abs(there[found] - here), 0)
-        both = inside.all(axis=1, keepdims=True)
+        both = np.asarray(inside.all(axis=1, keepdims=True))
         weights = np.where(both, lengths[:, ::-1] / np.maximum(1, lengths.sum(axis=1, keepdims=True)), inside)
         rows = np.where(inside, order[found], 0)
         nearer = np.where(both[:, 0], lengths.min(axis=1), lengths.max(axis=1))

@@ -21,13 +21,13 @@ from pathlib import Path
 
 import torch
 
+from turbogs_plugin.captures.camera_refinement import load_and_find, with_cameras
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.device import free_device_memory, processor_cores, synchronize
 from turbogs_plugin.distributed.processes import end_with_parent
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import Provenance, provenance
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.camera_refinement import load_and_find, with_cameras
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.results import CellResult, Failure, Study, StudyFolder, changes, flat_settings

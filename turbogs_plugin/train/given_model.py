@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from turbogs_plugin.captures.fingerprint import frame_of_state
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.gsplat_file import read_gsplat
@@ -20,7 +21,6 @@ from turbogs_plugin.model.gsplat_world import out_of_gsplat_world
 from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.model.torch_file import read_plain
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.fingerprint import frame_of_state
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
 

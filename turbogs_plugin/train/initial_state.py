@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from turbogs_plugin.captures.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.model.harmonics import with_degree
@@ -12,7 +13,6 @@ from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gau
 from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.plan.photo_gains import compare_exposures
 from turbogs_plugin.scene import PosedImages, Scene
-from turbogs_plugin.scene.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.train.given_model import load_given
 from turbogs_plugin.types import Gaussians
 

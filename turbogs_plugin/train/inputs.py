@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from turbogs_plugin.captures.camera_refinement import load_and_find, with_cameras
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.ranks import ONE, Ranks
@@ -18,7 +19,6 @@ from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.plan.memory import require_gpu_memory
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.camera_refinement import load_and_find, with_cameras
 from turbogs_plugin.train.given_model import read_given
 from turbogs_plugin.train.progress import LoadingProgress
 from turbogs_plugin.train.run_files import RunFolder

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import torch
 
+from turbogs_plugin.captures.camera_refinement import refine_cameras
+from turbogs_plugin.captures.kinds import holds_photos_alone
 from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, resolve
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine.layout import MAX_VIEWS
@@ -20,8 +22,6 @@ from turbogs_plugin.plan import Plan, make_plan
 from turbogs_plugin.plan.caps import cap_of
 from turbogs_plugin.plan.memory import hold_to_limit, most_views, within_memory
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.camera_refinement import refine_cameras
-from turbogs_plugin.scene.load import holds_photos_alone
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.clock import WallClock, WallRecord
 from turbogs_plugin.train.history import rewind_history

@@ -10,10 +10,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from turbogs_plugin.captures.fingerprint import frame_of_state
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Frame, PosedImages, Scene
-from turbogs_plugin.scene.fingerprint import frame_of_state
 from turbogs_plugin.train.checkpoint import gaussians_of_state, latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.given_model import load_given, require_model
 from turbogs_plugin.train.inputs import open_scene

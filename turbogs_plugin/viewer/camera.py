@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from turbogs_plugin.engine.reference.projection import rotation_matrices
-from turbogs_plugin.scene.poses import quaternions
+from turbogs_plugin.scene.geometry import quaternions
 from turbogs_plugin.types import Cameras
 
 SMALLEST_SIDE, LARGEST_SIDE = 16, 1920

@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.poses import evenly
+from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.frames import Screen
 from turbogs_plugin.viewer.model_state import CaptureViews

@@ -1,0 +1,496 @@
+"""COLMAP captures: what is read, in which frame, at which size; and what is refused, with which words."""
+
+import os
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from helpers.refusals import assert_refused
+from PIL import ExifTags, Image
+
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.captures.colmap import find_model, read_colmap
+from turbogs_plugin.errors import InputError
+
+SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[3] / "shared" / "scenes"))
+
+
+def rotation(angle: float) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+
+
+def write_capture(
+    folder: Path,
+    *,
+    views: int = 9,
+    cameras: tuple[tuple[str, int, int, list[float]], ...] = (("PINHOLE", 40, 24, [50.0, 52.0, 21.0, 11.0]),),
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    scale: float = 1.0,
+    model: str = "sparse/0",
+    suffix: str = ".bin",
+    nested: bool = False,
+    num_points: int = 20,
+) -> Path:
+    """A capture whose view i has camera ``i % len(cameras)`` at ``scale * (i, 0, -5) + shift``, turned a little, and
+    photos whose pixel (x, y) is (6x, 6y, 20i)."""
+    reconstruction = pycolmap.Reconstruction()
+    for number, (kind, width, height, params) in enumerate(cameras, start=1):
+        reconstruction.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=number, model=kind, width=width, height=height, params=params)
+        )
+    random = np.random.default_rng(0)
+    for view in range(views):
+        number = view % len(cameras)
+        name = (f"left/{view % 2}/" if nested else "") + f"photo{view:02d}.png"
+        turn = rotation(0.1 * view)
+        center = scale * np.array([view, 0.0, -5.0]) + shift
+        pose = pycolmap.Rigid3d(np.concatenate([turn, -(turn @ center)[:, None]], axis=1))
+        image = pycolmap.Image(name, np.zeros((num_points, 2)), camera_id=number + 1, image_id=view + 1)
+        reconstruction.add_image_with_trivial_frame(image, pose)
+        width, height = cameras[number][1:3]
+        x, y = np.meshgrid(np.arange(width), np.arange(height))
+        path = folder / "images" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pixels = np.stack([6 * x, 6 * y, np.full_like(x, 20 * view)], axis=-1).astype(np.uint8)
+        Image.fromarray(pixels).save(path)
+    for point in range(num_points):
+        track = pycolmap.Track([pycolmap.TrackElement(1, point), pycolmap.TrackElement(2, point)])
+        xyz = scale * random.normal(size=3) + shift
+        number = reconstruction.add_point3D(xyz, track, np.array([point, 2, 3], dtype=np.uint8))
+    (folder / model).mkdir(parents=True)
+    {".bin": reconstruction.write_binary, ".txt": reconstruction.write_text}[suffix](folder / model)
+    return folder
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@pytest.mark.parametrize("model", ["sparse/0", "sparse", "colmap/sparse/0"])
+def test_reads_cameras_points_and_photos(tmp_path, model, suffix):
+    scene = load_scene(write_capture(tmp_path / "cup", model=model, suffix=suffix))
+    assert scene.name == "cup"
+    assert scene.test.names == ("photo00.png", "photo08.png")
+    assert scene.train.names == tuple(f"photo{view:02d}.png" for view in range(1, 8))
+    assert scene.points.shape == (20, 3) and scene.points.dtype == torch.float32 and not scene.drawn_points
+    assert scene.point_colors.dtype == torch.uint8 and scene.point_colors[:, 0].tolist() == list(range(20))
+    centers = scene.frame.restore_points(scene.train.cameras.centers.numpy())
+    np.testing.assert_allclose(centers, [[view, 0, -5] for view in range(1, 8)], atol=1e-5)
+    for view, viewmat in zip(range(1, 8), scene.train.cameras.viewmats, strict=True):
+        np.testing.assert_allclose(viewmat[:3, :3], rotation(0.1 * view), atol=1e-6)
+    np.testing.assert_array_equal(scene.train.cameras.sizes, [[40, 24]] * 7)
+    np.testing.assert_allclose(scene.train.cameras.Ks[2], [[50, 0, 21], [0, 52, 11], [0, 0, 1]])
+    image = scene.train.photos.image(3)
+    assert image.shape == (24, 40, 3)
+    np.testing.assert_allclose(image[5, 7] * 255, [42, 30, 80], atol=1e-4)
+
+
+def test_cameras_that_turn_on_the_spot_have_an_extent(tmp_path):
+    folder = write_capture(tmp_path / "cup", scale=1e-12, shift=(1.0, 0.0, 0.0))
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    for point in model.points3D.values():
+        point.xyz = [1.0, 0.0, 7.0]
+    model.write_binary(folder / "sparse/0")
+    scene = load_scene(folder)
+    assert scene.extent == 1.0
+    assert scene.frame.scale == pytest.approx(1.1 * 7.0)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
+def test_place_and_unit_of_the_capture_do_not_matter(tmp_path, scale):
+    """Means at 10^6 from the origin and any unit give the same normalised scene as near the origin."""
+    near = load_scene(write_capture(tmp_path / "near"))
+    far = load_scene(write_capture(tmp_path / "far", scale=scale, shift=(1e6, -2e6, 3e5)))
+    # A float64 at 2e6 resolves 2e-10, and the poses hold sums of products of such numbers.
+    tolerance = 1e-6 + 5e-9 / scale
+    np.testing.assert_allclose(far.points, near.points, atol=tolerance)
+    np.testing.assert_allclose(far.train.cameras.viewmats, near.train.cameras.viewmats, atol=tolerance)
+    assert far.frame.scale == pytest.approx(scale * near.frame.scale, rel=tolerance)
+
+
+def test_several_cameras_sizes_and_nested_folders(tmp_path):
+    cameras = (("PINHOLE", 40, 24, [50.0, 52.0, 21.0, 11.0]), ("SIMPLE_PINHOLE", 16, 33, [30.0, 8.0, 16.0]))
+    scene = load_scene(write_capture(tmp_path / "cup", cameras=cameras, nested=True, views=10))
+    # In name order the even photos (folder left/0, camera 0) come first.
+    assert scene.test.names == ("left/0/photo00.png", "left/1/photo07.png")
+    assert scene.train.names[0] == "left/0/photo02.png" and len(scene.train) == 8
+    sizes = {name: size.tolist() for name, size in zip(scene.train.names, scene.train.cameras.sizes, strict=True)}
+    assert sizes["left/0/photo04.png"] == [40, 24] and sizes["left/1/photo05.png"] == [16, 33]
+    view = scene.train.names.index("left/1/photo05.png")
+    np.testing.assert_allclose(scene.train.cameras.Ks[view], [[30, 0, 8], [0, 30, 16], [0, 0, 1]])
+    assert scene.train.photos.image(view).shape == (33, 16, 3)
+    np.testing.assert_allclose(scene.train.photos.image(view)[20, 3] * 255, [18, 120, 100], atol=1e-4)
+
+
+def test_factor_scales_intrinsics_by_the_actual_sizes(tmp_path):
+    cameras = (("PINHOLE", 42, 25, [50.0, 52.0, 21.0, 11.0]),)
+    scene = load_scene(write_capture(tmp_path / "cup", cameras=cameras), factor=4)
+    assert scene.train.cameras.sizes[0].tolist() == [11, 6]  # 10.5 and 6.25 to the nearest
+    expected = [[50 * 11 / 42, 0, 21 * 11 / 42], [0, 52 * 6 / 25, 11 * 6 / 25], [0, 0, 1]]
+    np.testing.assert_allclose(scene.train.cameras.Ks[0], expected, rtol=1e-6)
+    assert scene.train.photos.image(0).shape == (6, 11, 3)
+
+
+@pytest.mark.parametrize("case", ["used", "one is missing", "wrong size"])
+def test_reduced_copies_are_used_only_where_all_fit(tmp_path, case):
+    folder = write_capture(tmp_path / "cup")
+    (folder / "images_2").mkdir()
+    for view in range(9):
+        Image.new("RGB", (20, 12), (1, 2, 3)).save(folder / "images_2" / f"photo{view:02d}.png")
+    if case == "one is missing":
+        (folder / "images_2" / "photo04.png").unlink()
+    elif case == "wrong size":
+        Image.new("RGB", (17, 12), (1, 2, 3)).save(folder / "images_2" / "photo04.png")
+    scene = load_scene(folder, factor=2)
+    assert (scene.train.photos.colors[0].tolist() == [1, 2, 3]) is (case == "used")
+    assert scene.train.cameras.sizes[0].tolist() == [20, 12]
+
+
+def replace_photo(folder: Path, content: bytes) -> None:
+    (folder / "images" / "photo03.png").write_bytes(content)
+
+
+def truncate_photo(folder: Path) -> None:
+    path = folder / "images" / "photo03.png"
+    path.write_bytes(path.read_bytes()[:60])
+
+
+def wrong_size(folder: Path) -> None:
+    Image.new("RGB", (24, 40)).save(folder / "images" / "photo03.png")
+
+
+def turned_photo(folder: Path) -> None:
+    orientation = Image.Exif()
+    orientation[ExifTags.Base.Orientation] = 6
+    Image.new("RGB", (24, 40)).save(folder / "images" / "photo03.png", exif=orientation)
+
+
+def spoilt_text(folder: Path) -> None:
+    pycolmap.Reconstruction(folder / "sparse/0").write_text(folder / "sparse/0")
+    for file in (folder / "sparse/0").glob("*.bin"):
+        file.unlink()
+    images = folder / "sparse/0/images.txt"
+    images.write_text(images.read_text().replace("photo03.png", "photo03.png\nx y"))
+
+
+def deep_photo(folder: Path) -> None:
+    Image.fromarray(np.full((24, 40), 3000, dtype=np.uint16)).save(folder / "images" / "photo03.png")
+
+
+def remove_photos(folder: Path) -> None:
+    for view in range(2, 9):
+        (folder / "images" / f"photo{view:02d}.png").unlink()
+
+
+def capitals(folder: Path) -> None:
+    for path in list((folder / "images").iterdir()):
+        path.rename(path.with_suffix(".PNG"))
+
+
+def remove_model(folder: Path) -> None:
+    (folder / "sparse/0/points3D.bin").unlink()
+
+
+def remove_most_of_the_model(folder: Path) -> None:
+    remove_model(folder)
+    (folder / "sparse/0/images.bin").unlink()
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (remove_model, r"has no points3D\.bin: bring back what is missing, or delete that folder and find"),
+        (remove_most_of_the_model, r"sparse/0 has no images\.bin and no points3D\.bin: bring back"),
+        (capitals, r"9 of 9 photos are missing in .*; photo00\.PNG is there: give the files the letters"),
+        (remove_photos, r"7 of 9 photos are missing in .*images: photo02.png, photo03.png, photo04.png, \.\.\.; bring"),
+        (lambda folder: replace_photo(folder, b"\xff"), "cannot read the photo .*photo03.png"),
+        (lambda folder: replace_photo(folder, b""), "cannot read the photo .*photo03.png"),
+        (truncate_photo, "cannot read the photo .*photo03.png"),
+        (wrong_size, "photo03.png is 24x40 but its camera is 40x24: it was cropped or turned"),
+        (turned_photo, "photo03.png is 24x40 but its camera is 40x24: its EXIF orientation turns it, .*-auto-orient"),
+        (deep_photo, "photo03.png has more than 8 bits a channel"),
+        (spoilt_text, r"images\.txt is damaged: line \d+ is not the features of an image: .*; copy or reconstruct"),
+    ],
+)
+def test_bad_files_are_named(tmp_path, damage, words):
+    folder = write_capture(tmp_path / "cup")
+    damage(folder)
+    assert_refused(words, load_scene, folder)
+
+
+@pytest.mark.parametrize(
+    ("capture", "arguments", "words"),
+    [
+        ({"views": 2}, {}, "has 2 images: at least 3"),
+        ({}, {"test_every": 1}, "every image of .* would be a test image"),
+        ({}, {"test_every": 0}, "test_every is 0"),
+        ({}, {"factor": 0}, "factor is 0"),
+        ({}, {"factor": 2.5}, "factor is 2.5"),
+        (
+            {"cameras": (("OPENCV", 40, 24, [50.0, 50.0, 20.0, 12.0, np.nan, 0, 0, 0]),)},
+            {},
+            "not those of a lens|Verify",
+        ),
+        ({"cameras": (("EQUIRECTANGULAR", 40, 24, [40, 24]),)}, {}, "camera 1 of .* is EQUIRECTANGULAR, a panorama"),
+        ({"cameras": (("PINHOLE", 40, 24, [np.nan, 52.0, 21.0, 11.0]),)}, {}, "intrinsics|VerifyParams"),
+    ],
+)
+def test_bad_captures_are_refused(tmp_path, capture, arguments, words):
+    folder = write_capture(tmp_path / "cup", **capture)
+    assert_refused(words, load_scene, folder, **arguments)
+
+
+def test_without_points_random_ones_are_drawn(tmp_path):
+    scene = load_scene(write_capture(tmp_path / "cup", num_points=0))
+    assert len(scene.points) == len(scene.point_colors) == 50_000 and scene.drawn_points
+    assert scene.notes[0].endswith("9 images, no points, so 50,000 random ones about what the cameras look at")
+    again = load_scene(tmp_path / "cup")
+    assert torch.equal(scene.points, again.points)
+
+
+def test_no_such_scene(tmp_path):
+    with pytest.raises(InputError, match="no such scene"):
+        load_scene(tmp_path / "absent")
+
+
+def test_a_model_without_images_is_refused(tmp_path):
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    pycolmap.Reconstruction().write_binary(tmp_path / "sparse/0")
+    with pytest.raises(InputError, match="no images with a pose"):
+        load_scene(tmp_path)
+
+
+def test_a_reconstruction_without_any_file_beside_photos(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    shutil.rmtree(folder / "sparse/0")
+    assert_refused("9 photos and no reconstruction in .*sparse: bring its files .*'turbogs reco", load_scene, folder)
+
+
+def test_the_alpha_of_a_photo_is_a_mask(tmp_path):
+    """Any that is not zero keeps its pixel, in the colour that it has."""
+    folder = write_capture(tmp_path / "cup")
+    photo = Image.new("RGBA", (40, 24), (200, 100, 50, 51))
+    photo.paste((255, 255, 255, 0), (0, 0, 40, 6))
+    photo.save(folder / "images" / "photo01.png")
+    scene = load_scene(folder)
+    train = scene.train
+    assert scene.notes[-1] == "1 photos have masked pixels by their alpha, 25.0% of them"
+    assert train.photos.image(0)[10, 0].mul(255).tolist() == [200, 100, 50]
+    expected = np.zeros((24, 40), dtype=bool)
+    expected[6:] = True
+    assert np.array_equal(train.mask(0), expected) and train.mask(1) is None
+
+
+@pytest.mark.skipif(not (SCENES / "fox").is_dir(), reason=f"no real captures in {SCENES}")
+def test_real_capture():
+    scene = load_scene(SCENES / "fox", factor=4)
+    assert (len(scene.train), len(scene.test), len(scene.points)) == (43, 7, 15579)
+    assert scene.train.photos.sizes.tolist() == [[210, 375]] * 43
+    # Points are where photos have their colour: most project to a pixel of about their own.
+    cameras, image = scene.train.cameras, scene.train.photos.image(20)
+    local = scene.points @ cameras.viewmats[20, :3, :3].T + cameras.viewmats[20, :3, 3]
+    pixels = local @ cameras.Ks[20].T
+    pixels = (pixels[:, :2] / pixels[:, 2:]).floor().long()
+    shown = (local[:, 2] > 0) & (pixels >= 0).all(dim=1) & (pixels < torch.tensor([210, 375])).all(dim=1)
+    differences = image[pixels[shown, 1], pixels[shown, 0]] - scene.point_colors[shown] / 255
+    shifted = image[pixels[shown, 1], 209 - pixels[shown, 0]] - scene.point_colors[shown] / 255
+    assert differences.abs().mean(dim=1).median() < 0.6 * shifted.abs().mean(dim=1).median()
+
+
+def test_of_several_models_the_largest_is_taken_and_said(tmp_path):
+    folder = write_capture(tmp_path / "cup", views=4)
+    for name, views in (("1", 9), ("2", 7), ("10", 9)):
+        write_capture(tmp_path / name, views=views, suffix=".txt" if name == "2" else ".bin")
+        shutil.copytree(tmp_path / name / "sparse/0", folder / "sparse" / name)
+    shutil.copytree(tmp_path / "1" / "images", folder / "images", dirs_exist_ok=True)
+    scene = load_scene(folder)
+    assert len(scene.train) + len(scene.test) == 9
+    said = "4 reconstructions in .*sparse: 1 is taken for most images .0 has 4, 1 has 9, 2 has 7, 10 has 9."
+    assert re.fullmatch(said, scene.notes[1])
+    assert re.fullmatch("COLMAP reconstruction .*sparse/1 .binary.: 9 images, 20 points", scene.notes[0])
+
+
+@pytest.mark.parametrize("place", [".", "photos", "images/full/jpg", "../images", "rgb/left"])
+def test_photos_in_other_folders(tmp_path, place):
+    folder = write_capture(tmp_path / "captures" / "cup", nested=True)
+    (folder / "images").rename(tmp_path / "photos")
+    if place == ".":
+        (tmp_path / "photos" / "left").rename(folder / "left")
+    else:
+        (folder / place).resolve().parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "photos").rename((folder / place).resolve())
+    scene = load_scene(folder)
+    assert len(scene.train) == 7 and "photos in " in scene.notes[0]
+
+
+def test_copies_that_the_cameras_were_reconstructed_from(tmp_path):
+    """Nothing of full size is there, neither photos nor cameras: factors count from the copies."""
+    folder = write_capture(tmp_path / "cup")
+    (folder / "images").rename(folder / "images_4")
+    scene = load_scene(folder)
+    assert scene.train.cameras.sizes[0].tolist() == [40, 24] and len(scene.notes) == 1
+    assert "photos in " in scene.notes[0] and "images_4" in scene.notes[0]
+    assert load_scene(folder, factor=2).train.cameras.sizes[0].tolist() == [20, 12]
+    (folder / "images_4" / "photo03.png").unlink()
+    assert len(load_scene(folder).train) == 7
+    for photo in list((folder / "images_4").iterdir())[2:]:
+        photo.unlink()
+    with pytest.raises(InputError, match=r"7 of 9 photos are missing in .*images_4: .*; bring them back"):
+        load_scene(folder)
+
+
+def test_images_without_their_photo_are_left_out(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    for view in (0, 3):
+        (folder / "images" / f"photo{view:02d}.png").unlink()
+    scene = load_scene(folder)
+    assert scene.test.names == ("photo01.png",) and len(scene.train) == 6
+    assert scene.notes[1:] == ("2 of 9 images are left out, their photos do not exist: photo00.png, ...",)
+    np.testing.assert_allclose(scene.train.photos.image(1)[0, 0] * 255, [0, 0, 80], atol=1e-4)  # photo04's
+    centers = scene.frame.restore_points(scene.train.cameras.centers.numpy())
+    np.testing.assert_allclose(centers[:, 0], [2, 4, 5, 6, 7, 8], atol=1e-5)
+
+
+@pytest.mark.parametrize(("place", "refused"), [(1e14, False), (1e30, True), (1e300, True)])
+def test_a_point_that_is_too_far_for_float32_is_refused(tmp_path, place, refused):
+    """Squared distances of the first that is refused would be infinite, and so would a Gaussian's size."""
+    folder = write_capture(tmp_path / "cup")
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    model.add_point3D(np.array([place, 0.0, 0.0]), pycolmap.Track(), np.zeros(3, dtype=np.uint8))
+    model.write(folder / "sparse/0")
+    if not refused:
+        assert len(load_scene(folder).points) == 21
+        return
+    with pytest.raises(InputError, match="1 of 21 3D points lie too far from the cameras for float32: take them out"):
+        load_scene(folder)
+
+
+def test_photos_of_a_capture_beside_it_do_not_stand_in_for_some(tmp_path):
+    """All of them may lie beside the capture; a part may be others of the same names."""
+    folder = write_capture(tmp_path / "cup")
+    (folder / "images").rename(tmp_path / "images")
+    assert len(load_scene(folder).train) == 7
+    (tmp_path / "images" / "photo03.png").unlink()
+    with pytest.raises(InputError, match=r"9 of 9 photos are missing in .*cup/images: .*bring them back"):
+        load_scene(folder)
+
+
+@pytest.mark.parametrize("other", ["depth", "normals", "segmentation", "images_backup", "images_2", "../images"])
+@pytest.mark.parametrize("kept", [3, 8])
+def test_where_photos_were_taken_away_no_other_folder_stands_in(tmp_path, other, kept):
+    """It has images of all names, which may be depth maps, copies or another capture's photos."""
+    folder = write_capture(tmp_path / "cup")
+    shutil.copytree(folder / "images", folder / other)
+    for photo in sorted((folder / "images").iterdir())[: 9 - kept]:
+        photo.unlink()
+    capture = read_colmap(folder, *find_model(folder))
+    assert capture.photo_folder == folder / "images" and len(capture.names) == kept and capture.reduction == 1
+    assert capture.notes[1].startswith(f"{9 - kept} of 9 images are left out, ")
+
+
+@pytest.mark.parametrize("other", ["depth", "normals", "segmentation"])
+def test_images_that_are_no_photos_do_not_stand_in_for_all(tmp_path, other):
+    folder = write_capture(tmp_path / "cup")
+    (folder / "images").rename(folder / other)
+    with pytest.raises(InputError, match=r"9 of 9 photos are missing in .*cup/images: .*bring them back"):
+        load_scene(folder)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_names_with_spaces(tmp_path, suffix):
+    folder = write_capture(tmp_path / "cup")
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    for image in model.images.values():
+        (folder / "images" / image.name).rename(folder / "images" / image.name.replace("photo", " my  photo "))
+        image.name = image.name.replace("photo", " my  photo ")
+    shutil.rmtree(folder / "sparse/0")
+    (folder / "sparse/0").mkdir()
+    (model.write_binary if suffix == ".bin" else model.write_text)(folder / "sparse/0")
+    capture = read_colmap(folder, *find_model(folder))
+    assert capture.names == tuple(f" my  photo {view:02d}.png" for view in range(9)) and len(capture.notes) == 1
+    assert capture.viewmats[3] @ [3.0, 0, -5, 1] == pytest.approx([0, 0, 0, 1])
+
+
+def test_a_name_of_a_text_model_that_is_not_utf_8_is_refused(tmp_path):
+    folder = write_capture(tmp_path / "cup", suffix=".txt")
+    images = folder / "sparse/0/images.txt"
+    images.write_bytes(images.read_bytes().replace(b"photo03.png", b"ph\xf6to03.png"))
+    words = r"sparse/0: image name 'ph\\udcf6to03.png' has signs that cannot be printed: rename the photo"
+    assert_refused(words, load_scene, folder)
+
+
+@pytest.mark.parametrize(("size", "fits"), [((20, 12), True), ((21, 12), True), ((80, 48), True), ((20, 15), False)])
+def test_photos_in_other_sizes_than_their_cameras(tmp_path, size, fits):
+    folder = write_capture(tmp_path / "cup")
+    for path in (folder / "images").iterdir():
+        Image.open(path).resize(size, Image.Resampling.BOX).save(path)
+    if not fits:
+        with pytest.raises(InputError, match=r"photo00.png is 20x15 but its camera is 40x24: it was cropped"):
+            load_scene(folder)
+        return
+    scene = load_scene(folder)
+    width, height = size
+    assert scene.train.cameras.sizes.tolist() == [list(size)] * 7
+    expected = [[50 * width / 40, 0, 21 * width / 40], [0, 52 * height / 24, 11 * height / 24], [0, 0, 1]]
+    np.testing.assert_allclose(scene.train.cameras.Ks[0], expected, rtol=1e-6)
+    assert scene.notes[-1].endswith(
+        f"9 photos in another size than their cameras: intrinsics rescaled from 40x24 to {width}x{height}"
+    )
+
+
+def test_rigs(tmp_path):
+    """Two cameras on one rig: every image has its own pose, composed by hand here."""
+    reconstruction = pycolmap.Reconstruction()
+    offset = np.concatenate([rotation(0.3), [[1.0], [0.5], [0.0]]], axis=1)  # the second camera from the rig
+    rig = pycolmap.Rig(rig_id=1)
+    for number in (1, 2):
+        camera = pycolmap.Camera(camera_id=number, model="PINHOLE", width=40, height=24, params=[50.0, 52, 21, 11])
+        reconstruction.add_camera(camera)
+        if number == 1:
+            rig.add_ref_sensor(camera.sensor_id)
+        else:
+            rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d(offset))
+    reconstruction.add_rig(rig)
+    expected = {}
+    for step in range(4):
+        pose = np.concatenate([rotation(0.1 * step), [[step], [0.0], [5.0]]], axis=1)
+        frame = pycolmap.Frame(frame_id=step + 1, rig_id=1, rig_from_world=pycolmap.Rigid3d(pose))
+        images = []
+        for number in (1, 2):
+            name = f"{number}/{step}.png"
+            image = pycolmap.Image(name, np.zeros((5, 2)), camera_id=number, image_id=2 * step + number)
+            image.frame_id = step + 1
+            frame.add_data_id(image.data_id)
+            images.append(image)
+            whole = np.vstack([pose, [0, 0, 0, 1]])
+            expected[name] = whole if number == 1 else np.vstack([offset, [0, 0, 0, 1]]) @ whole
+            path = tmp_path / "images" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.new("RGB", (40, 24)).save(path)
+        reconstruction.add_frame(frame)
+        for image in images:
+            reconstruction.add_image(image)
+    for step in range(4):
+        reconstruction.register_frame(step + 1)
+    for point in range(5):
+        track = pycolmap.Track([pycolmap.TrackElement(1, point), pycolmap.TrackElement(2, point)])
+        reconstruction.add_point3D(np.array([point, 1.0, 5.0]), track, np.zeros(3, dtype=np.uint8))
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    reconstruction.write_binary(tmp_path / "sparse/0")
+    capture = read_colmap(tmp_path, *find_model(tmp_path))
+    assert set(capture.names) == set(expected)
+    for name, viewmat in zip(capture.names, capture.viewmats, strict=True):
+        np.testing.assert_allclose(viewmat, expected[name], atol=1e-9)
+
+
+def test_names_of_a_model_made_on_windows(tmp_path):
+    """Photos in folders have backslashes in their names there."""
+    folder = write_capture(tmp_path / "cup", nested=True)
+    names = load_scene(folder).train.names
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    for image in model.images.values():
+        image.name = image.name.replace("/", "\\")
+    model.write_binary(folder / "sparse/0")
+    assert load_scene(folder).train.names == names and names[0].startswith("left/0/")

@@ -1,0 +1,212 @@
+"""Loaders against damaged and hostile files: a clear error or a correct result, in bounded memory, never a crash."""
+
+import random
+import struct
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from helpers.bounded_memory import outcome_within
+from helpers.framework_runs import thin_out_points
+
+from turbogs_plugin.captures import write_demo_capture
+from turbogs_plugin.captures.colmap import read_colmap
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.ply import load_ply, save_ply
+from turbogs_plugin.types import Gaussians
+
+NAN, INF, HUGE = struct.pack("<d", np.nan), struct.pack("<d", np.inf), struct.pack("<Q", 2**60)
+FILES = ("cameras", "images", "points3D")
+MEMORY = 32 * 2**20
+"""Python and numpy may allocate this much for files of some 50 kB, however large their counts."""
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    """A capture whose model is there twice: sparse/0 in binary, text as text."""
+    folder = write_demo_capture(tmp_path_factory.mktemp("hostile") / "demo", views=4, width=32, height=24)
+    thin_out_points(folder, 8)
+    (folder / "text").mkdir()
+    pycolmap.Reconstruction(folder / "sparse/0").write_text(folder / "text")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model_ply(tmp_path_factory) -> Path:
+    generator = torch.Generator().manual_seed(0)
+    shapes = {"means": (30, 3), "quats": (30, 4), "scales": (30, 3), "opacities": (30,), "sh0": (30, 1, 3)}
+    values = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
+    path = tmp_path_factory.mktemp("ply") / "model.ply"
+    save_ply(Gaussians(**values, shN=torch.randn(30, 3, 3, generator=generator)), path)
+    return path
+
+
+def mutate(content: bytes, choice: random.Random) -> bytes:
+    """Cut, overwritten in some bytes, with a hostile number in it, or with a piece moved into it."""
+    data = bytearray(content)
+    kind, place = choice.randrange(4), choice.randrange(len(data))
+    if kind == 0:
+        del data[place:]
+    elif kind == 1:
+        for _ in range(choice.choice([1, 1, 4])):
+            data[choice.randrange(len(data))] = choice.randrange(256)
+    elif kind == 2:
+        place = choice.choice([0, 8, 12, 16, 24, place])
+        data[place : place + 8] = choice.choice([b"\xff" * 8, HUGE, bytes(8), NAN, INF])
+    else:
+        source = choice.randrange(len(data))
+        data[place:place] = data[source : source + choice.randrange(64)]
+    return bytes(data)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@pytest.mark.parametrize("file", FILES)
+def test_mutated_models(capture, tmp_path, file, suffix):
+    """What is read in spite of a mutation is finite and whole; most mutations are noticed."""
+    intact = {path: path.read_bytes() for path in (capture / ("text" if suffix == ".txt" else "sparse/0")).iterdir()}
+    for path, content in intact.items():
+        (tmp_path / path.name).write_bytes(content)
+    choice = random.Random(f"{file}{suffix}")
+    target = tmp_path / f"{file}{suffix}"
+    content, errors, cases = target.read_bytes(), 0, 120
+    for _ in range(cases):
+        target.write_bytes(mutate(content, choice))
+        result = outcome_within(MEMORY, read_colmap, capture, tmp_path, suffix)
+        if isinstance(result, InputError):
+            errors += 1
+        else:
+            assert all(np.isfinite(array).all() for array in (result.viewmats, result.Ks, result.points))
+    # A number changed into another, or a comment, is no damage that one could see.
+    assert errors > (0.5 if suffix == ".bin" else 0.15) * cases
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"])
+def test_mutated_lenses(capture, tmp_path, model):
+    """Lenses of any numbers: a pinhole that the photo fills, or an error; the photos' size bounds the work."""
+    for path in (capture / "sparse/0").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    reconstruction = pycolmap.Reconstruction(capture / "sparse/0")
+    lens = pycolmap.Camera.create_from_model_name(1, model, 30.0, 32, 24)
+    cameras = bytearray(struct.pack("<QIiQQ", 1, next(iter(reconstruction.cameras)), int(lens.model), 32, 24))
+    intact = bytes(cameras) + lens.params.tobytes()
+    choice, errors, target = random.Random(model), 0, tmp_path / "cameras.bin"
+    first = len(cameras)
+    for _ in range(100):
+        data = bytearray(intact)
+        place = choice.randrange(first, len(data), 8)
+        value = choice.choice(
+            [NAN, INF, HUGE, struct.pack("<d", choice.uniform(-2, 2) * 10 ** choice.randrange(-3, 9))]
+        )
+        data[place : place + 8] = value
+        target.write_bytes(data)
+        result = outcome_within(MEMORY, read_colmap, capture, tmp_path, ".bin")
+        if isinstance(result, InputError):
+            errors += 1
+        else:
+            assert np.isfinite(result.Ks).all() and (result.sizes >= 1).all() and (result.sizes <= 64).all()
+            assert all(lens is None or np.abs(lens.sources).max() < 1.1 for lens in result.lenses)
+    assert 10 < errors < 100
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("length", [0, 1, 7, 8, 20, -1])
+def test_truncated_binaries(capture, tmp_path, file, length):
+    for path in (capture / "sparse/0").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    target = tmp_path / f"{file}.bin"
+    target.write_bytes(target.read_bytes()[:length])
+    with pytest.raises(InputError, match=f"{file}.bin is damaged"):
+        read_colmap(capture, tmp_path, ".bin")
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("count", [2**31, 2**60, 2**64 - 1])
+def test_counts_beyond_the_file(capture, tmp_path, file, count):
+    for path in (capture / "sparse/0").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    target = tmp_path / f"{file}.bin"
+    target.write_bytes(struct.pack("<Q", count) + target.read_bytes()[8:])
+    error = outcome_within(MEMORY, read_colmap, capture, tmp_path, ".bin")
+    assert isinstance(error, InputError) and f"announces {count} records" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("file", "place", "replacement", "words"),
+    [
+        ("images", 8 + 4, NAN, "image 1 has a pose that is not finite"),
+        ("images", 8 + 4, bytes(32), "damaged: .* zero rotation; copy or reconstruct it again"),
+        ("images", 8 + 4 + 32, INF, "image 1 has a pose that is not finite"),
+        ("points3D", 8 + 8, NAN, "1 of .* 3D points are not finite: export or reconstruct it again"),
+        ("images", 8 + 60, struct.pack("<I", 7), "has camera 7, which"),
+        ("cameras", 8 + 4, struct.pack("<i", 99), "unknown model 99"),
+        ("cameras", 8 + 8, struct.pack("<Q", 2**60), "is 1152921504606846976x24 pixels"),
+        ("cameras", 8 + 8, struct.pack("<Q", 10**6), "a size outside 1 .. 65535 .*: export or reconstruct it"),
+        ("cameras", 8 + 24, struct.pack("<d", -5.0), "positive focal lengths|not a COLMAP"),
+    ],
+)
+def test_bad_values(capture, tmp_path, file, place, replacement, words):
+    for path in (capture / "sparse/0").iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    target = tmp_path / f"{file}.bin"
+    content = bytearray(target.read_bytes())
+    content[place : place + len(replacement)] = replacement
+    target.write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        read_colmap(capture, tmp_path, ".bin")
+
+
+@pytest.mark.parametrize("name", ["../w_001.png", "a/../../b.pn", "/etc/passwd0", "C:\\photo.png", "..\\w_001.png"])
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_names_that_leave_the_photo_folder(capture, tmp_path, name, suffix):
+    for path in (capture / ("text" if suffix == ".txt" else "sparse/0")).iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    target = tmp_path / f"images{suffix}"
+    target.write_bytes(target.read_bytes().replace(b"view_001.png", name.encode()))
+    with pytest.raises(InputError, match="leaves the photo folder"):
+        read_colmap(capture, tmp_path, suffix)
+
+
+def test_mutated_ply(model_ply, tmp_path):
+    choice, content, errors = random.Random(1), model_ply.read_bytes(), 0
+    header = content.index(b"end_header") + 11
+    target = tmp_path / "mutated.ply"
+    for case in range(300):
+        # Every second case goes for the header, which is the smaller part.
+        mutated = mutate(content[:header], choice) + content[header:] if case % 2 else mutate(content, choice)
+        target.write_bytes(mutated)
+        result = outcome_within(MEMORY, load_ply, target)
+        if isinstance(result, InputError):
+            errors += 1
+        else:
+            assert all(value.isfinite().all() for _, value in result.items())
+    assert errors > 150
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (b"element vertex 30", b"element vertex 1152921504606846976", "not a whole .ply file"),
+        (b"element vertex 30", b"element vertex 31", "not a whole .ply file"),
+        (b"element vertex 30", b"element vertex 29", "not a whole .ply file"),
+        (b"element vertex 30", b"element vertex -1", "not a whole .ply file"),
+        (b"element vertex 30", b"element vertex " + b"9" * 5000, "not a whole .ply file"),
+        (b"property float x", b"property list uchar int x", "not a whole .ply file"),
+        (b"property float nx", b"property float x", "not a whole .ply file"),
+        (b"property float nx", b"property float f_rest_9", "10 properties f_rest_"),
+        (b"property float opacity", b"property float opacities", "lacks the properties opacity"),
+        (b"end_header\n", b"", "it has no header"),
+        (b"element vertex 30", b"element chunk 1\nelement vertex 30", "not a compressed .ply"),
+        (b"ply\n", b"", "not a .ply file"),
+    ],
+)
+def test_bad_ply_headers(model_ply, tmp_path, old, new, words):
+    target = tmp_path / "bad.ply"
+    content = model_ply.read_bytes()
+    assert old in content
+    target.write_bytes(content.replace(old, new, 1))
+    error = outcome_within(MEMORY, load_ply, target)
+    assert isinstance(error, InputError)
+    with pytest.raises(InputError, match=words):
+        raise error

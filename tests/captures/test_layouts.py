@@ -1,0 +1,281 @@
+"""Captures laid out as their makers publish them, with files that are not read lying about.
+
+Each shows painted points, so that photos, intrinsics and poses must belong together.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from helpers.painted import painted_photo, require_points_at_their_pixels
+from PIL import Image
+
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.plan import make_plan
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.train.look import Look
+from turbogs_plugin.train.metrics import evaluate
+from turbogs_plugin.train.trainer import Trainer
+
+POINTS = np.array([[0.3, 0.0, 0.1], [-0.2, 0.25, -0.3], [0.0, -0.4, 0.35]])
+VIEWS = 9
+
+
+def pose_of(view: int) -> np.ndarray:
+    """[3, 4] world to camera: 4 from the origin, looking at it, all a bit askew."""
+    turn, tilt = 0.15 * (view - 4), 0.1 * (view % 3)
+    forward = -np.array([np.sin(turn) * np.cos(tilt), np.sin(tilt), np.cos(turn) * np.cos(tilt)])
+    right = np.cross([0.05, -1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.concatenate([rotation, (rotation @ forward * 4.0)[:, None]], axis=1)
+
+
+def seen_at(view: int, camera: pycolmap.Camera) -> np.ndarray:
+    """[3, 2] pixels of the points."""
+    pose = pose_of(view)
+    return camera.img_from_cam(POINTS @ pose[:, :3].T + pose[:, 3])
+
+
+def write_model(folder: Path, cameras: list[pycolmap.Camera], names: list[str], suffix: str = ".bin") -> None:
+    """View i has camera ``i % len(cameras)``."""
+    model = pycolmap.Reconstruction()
+    for number, camera in enumerate(cameras, start=1):
+        camera.camera_id = number
+        model.add_camera_with_trivial_rig(camera)
+    for view, name in enumerate(names):
+        image = pycolmap.Image(name, np.zeros((3, 2)), camera_id=view % len(cameras) + 1, image_id=view + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose_of(view)))
+    for index, point in enumerate(POINTS):
+        elements = [pycolmap.TrackElement(1, index), pycolmap.TrackElement(2, index)]
+        model.add_point3D(point, pycolmap.Track(elements), np.full(3, 90, dtype=np.uint8))
+    folder.mkdir(parents=True)
+    (model.write_binary if suffix == ".bin" else model.write_text)(folder)
+
+
+def write_photos(folder: Path, cameras: list[pycolmap.Camera], names: list[str], reduction: float = 1) -> None:
+    for view, name in enumerate(names):
+        camera = cameras[view % len(cameras)]
+        size = (round(camera.width / reduction), round(camera.height / reduction))
+        places = seen_at(view, camera) * np.divide(size, (camera.width, camera.height))
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(painted_photo(size, places)).save(folder / name)
+
+
+def pinhole(width: int, height: int, focal: float) -> pycolmap.Camera:
+    params = [focal, 1.01 * focal, 0.5 * width + 1.0, 0.5 * height - 1.0]
+    return pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
+
+
+def require_painted(scene: Scene) -> None:
+    require_points_at_their_pixels(scene, scene.train, POINTS)
+    require_points_at_their_pixels(scene, scene.test, POINTS)
+
+
+NAMES = [f"_DSC{8670 + view}.png" for view in range(VIEWS)]
+
+
+@pytest.mark.parametrize("kept", [(1, 2, 4, 8), (4, 8), (8,)])
+def test_mip_nerf_360(tmp_path, kept):
+    """images, images_2, ... beside sparse/0 and poses_bounds.npy; those of full size, which take 10 GB, often gone."""
+    camera = [pinhole(240, 160, 200.0)]
+    write_model(tmp_path / "garden/sparse/0", camera, NAMES)
+    for reduction in kept:
+        write_photos(tmp_path / f"garden/images_{reduction}".removesuffix("_1"), camera, NAMES, reduction)
+    np.save(tmp_path / "garden/poses_bounds.npy", np.zeros((VIEWS, 17)))
+    for factor in {kept[0], 1}:
+        scene = load_scene(tmp_path / "garden", factor)
+        require_painted(scene)
+        assert scene.train.cameras.sizes[0].tolist() == [240 // kept[0], 160 // kept[0]]
+    assert "sparse/0 (binary): 9 images, 3 points" in scene.notes[0] and "poses_bounds.npy not used" in scene.notes
+    if kept[0] > 1:
+        assert f"intrinsics rescaled from 240x160 to {240 // kept[0]}x{160 // kept[0]}" in " ".join(scene.notes)
+        with pytest.raises(InputError, match=f"--factor 3: the largest photos .* images_{kept[0]}: use --factor"):
+            load_scene(tmp_path / "garden", 3)
+    if kept == (4, 8):
+        assert load_scene(tmp_path / "garden", 8).train.cameras.sizes[0].tolist() == [30, 20]
+
+
+def llff_table(camera: pycolmap.Camera) -> np.ndarray:
+    rows = []
+    for view in range(VIEWS):
+        pose = pose_of(view)
+        right, down, forward = pose[:, :3]
+        hwf = [camera.height, camera.width, camera.params[0]]
+        matrix = np.stack([down, right, -forward, -pose[:, :3].T @ pose[:, 3], hwf], axis=1)
+        rows.append([*matrix.ravel(), 2.0, 9.0])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_llff(tmp_path, full):
+    """images/IMG_*.JPG of COLMAP's sparse/0, and copies under other names; the former are often not kept."""
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=240, height=160, params=[200.0, 120.0, 80.0, 0.0])
+    names = [f"IMG_{4026 + view}.png" for view in range(VIEWS)]
+    write_model(tmp_path / "fern/sparse/0", [camera], names)
+    copies = [f"image{view:03d}.png" for view in range(VIEWS)]
+    write_photos(tmp_path / "fern/images_4", [camera], copies, 4)
+    write_photos(tmp_path / "fern/images_8", [camera], copies, 8)
+    if full:
+        write_photos(tmp_path / "fern/images", [camera], names)
+    np.save(tmp_path / "fern/poses_bounds.npy", llff_table(camera))
+    for name in ("simplices.npy", "trimesh.png", "database.db", "view_imgs.txt"):
+        (tmp_path / "fern" / name).write_bytes(b"not for us")
+    scene = load_scene(tmp_path / "fern", 1 if full else 4)
+    require_painted(scene)
+    if full:
+        assert "COLMAP" in scene.notes[0] and scene.notes[-1] == "poses_bounds.npy not used"
+    else:
+        assert "photos 60x40 of images_4" in scene.notes[0]
+        assert scene.notes[-1].endswith("sparse/0 not used, its photos are not there")
+
+
+def write_nerfstudio(folder: Path, cameras: list[pycolmap.Camera], names: list[str], **content) -> None:
+    """transforms.json of `ns-process-data`, each frame with intrinsics of its own, and sparse_pc.ply."""
+    frames = []
+    for view, name in enumerate(names):
+        pose, camera = np.eye(4), cameras[view % len(cameras)]
+        pose[:3] = pose_of(view)
+        to_world = np.linalg.inv(pose) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        own = dict(zip(("fl_x", "fl_y", "cx", "cy"), camera.params.tolist(), strict=True))
+        size = {"w": camera.width, "h": camera.height}
+        frames.append({"file_path": name, "transform_matrix": to_world.tolist(), "colmap_im_id": view, **own, **size})
+    everything = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "frames": frames}
+    everything |= {"applied_transform": np.eye(4)[:3].tolist(), "ply_file_path": "sparse_pc.ply", **content}
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "transforms.json").write_text(json.dumps(everything))
+    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    header += "property uint8 red\nproperty uint8 green\nproperty uint8 blue\nend_header\n"
+    (folder / "sparse_pc.ply").write_text(header + "".join(f"{x} {y} {z} 9 8 7\n" for x, y, z in POINTS))
+
+
+@pytest.mark.parametrize("colmap", [True, False])
+def test_nerfstudio(tmp_path, colmap):
+    """images, images_2, ..., sparse_pc.ply and often COLMAP's own folder."""
+    camera, names = [pinhole(240, 160, 200.0)], [f"frame_{view + 1:05d}.png" for view in range(VIEWS)]
+    write_nerfstudio(tmp_path / "poster", camera, [f"images/{name}" for name in names])
+    write_photos(tmp_path / "poster/images", camera, names)
+    write_photos(tmp_path / "poster/images_4", camera, names, 4)
+    if colmap:
+        write_model(tmp_path / "poster/colmap/sparse/0", camera, names)
+    for factor in (1, 4):
+        scene = load_scene(tmp_path / "poster", factor)
+        require_painted(scene)
+        assert scene.train.cameras.sizes[0].tolist() == [240 // factor, 160 // factor] and len(scene.points) == 3
+    assert ("transforms.json not used" in scene.notes) == colmap
+
+
+@pytest.mark.parametrize("size", [(210, 137), (208, 139)])
+@pytest.mark.parametrize("kept", ["input images", "input", "images of the cameras' size"])
+def test_convert_py_of_gaussian_splatting(tmp_path, size, kept):
+    """Photos in input, their cameras in distorted/sparse/0, and undistorted photos of the same names in images: some
+    look like scaled copies."""
+    camera, root = [pinhole(240, 160, 200.0)], tmp_path / "bonsai"
+    write_model(root / "distorted/sparse/0", camera, NAMES)
+    write_photos(root / "input", camera, NAMES)
+    for name in NAMES if "images" in kept else []:
+        photo = Image.open(root / "input" / name)
+        photo = photo.resize(size).transpose(Image.Transpose.ROTATE_180) if kept == "input images" else photo
+        (root / "images").mkdir(exist_ok=True)
+        photo.save(root / "images" / name)
+    expected = root / ("images" if kept.startswith("images") else "input")
+    for folder in (root / "distorted", root):
+        scene = load_scene(folder)
+        require_painted(scene)
+        assert (f", photos in {expected}" in scene.notes[0]) == (expected != folder / "images")
+
+
+@pytest.mark.parametrize(("model", "suffix"), [("colmap_sparse/0", ".bin"), ("colmap_text", ".txt")])
+def test_instant_ngp(tmp_path, model, suffix):
+    """transforms.json without points, and COLMAP's model in folders of colmap2nerf.py's names."""
+    camera = [pinhole(240, 160, 200.0)]
+    write_nerfstudio(tmp_path / "fox", camera, [f"images/{name}" for name in NAMES])
+    write_photos(tmp_path / "fox/images", camera, NAMES)
+    write_model(tmp_path / "fox" / model, camera, NAMES, suffix)
+    scene = load_scene(tmp_path / "fox")
+    require_painted(scene)
+    assert f"COLMAP reconstruction {tmp_path / 'fox' / model} " in scene.notes[0] and len(scene.points) == 3
+    assert scene.notes[1:] == ("transforms.json not used",)
+
+
+@pytest.mark.parametrize("trouble", ["photos", "some photos", "damaged", "incomplete"])
+def test_instant_ngp_whose_model_cannot_be_used(tmp_path, trouble):
+    camera, names = [pinhole(240, 160, 200.0)], NAMES
+    model = tmp_path / "fox/colmap_sparse/0"
+    write_nerfstudio(tmp_path / "fox", camera, [f"images/{name}" for name in names])
+    write_photos(tmp_path / "fox/images", camera, names)
+    if trouble == "photos":
+        names = [f"raw-{name}" for name in NAMES]
+    elif trouble == "some photos":  # too few
+        names = [*NAMES[:2], *(f"raw-{name}" for name in NAMES[2:])]
+    write_model(model, camera, names)
+    if trouble == "damaged":
+        (model / "images.bin").write_bytes(b"short")
+    elif trouble == "incomplete":
+        (model / "images.bin").unlink()
+    scene = load_scene(tmp_path / "fox")
+    require_painted(scene)
+    assert "transforms.json" in scene.notes[0]
+    assert scene.notes[-1].startswith(
+        {
+            "damaged": f"{model} is not used: {model / 'images.bin'} is damaged: ",
+            "incomplete": f"{model} is not used: it has no images.bin",
+        }.get(trouble, f"{model} not used, its photos are not there")
+    )
+
+
+@pytest.mark.parametrize("kind", ["llff", "transforms"])
+def test_a_model_in_parts_beside_other_poses_is_said(tmp_path, kind):
+    folder, camera = tmp_path / "fern", [pinhole(240, 160, 200.0)]
+    write_photos(folder / "images", camera, NAMES)
+    if kind == "llff":
+        np.save(folder / "poses_bounds.npy", llff_table(camera[0]))
+    else:
+        write_nerfstudio(folder, camera, [f"images/{name}" for name in NAMES])
+    before = load_scene(folder).notes
+    (folder / "sparse/0").mkdir(parents=True)
+    (folder / "sparse/0/cameras.bin").write_bytes(b"")
+    (folder / "sparse/0/points3D.txt").write_bytes(b"")
+    said = f"{folder / 'sparse/0'} is not used: it has no images.bin and no points3D.bin"
+    assert load_scene(folder).notes == (*before, said)
+
+
+@pytest.mark.parametrize("folder", ["colmap", "reconstruction/model"])
+def test_scannetpp(tmp_path, folder):
+    """The model as text in a folder of another name, photos in resized_images."""
+    cameras = [pinhole(240, 160, 200.0)]
+    write_model(tmp_path / "dslr" / folder, cameras, NAMES, ".txt")
+    write_photos(tmp_path / "dslr/resized_images", cameras, NAMES)
+    scene = load_scene(tmp_path / "dslr")
+    require_painted(scene)
+    assert "photos in" in scene.notes[0] and "resized_images" in scene.notes[0]
+
+
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_one_camera_a_photo_upright_and_lying(tmp_path, kind):
+    """It trains, too: every view has another size."""
+    sizes = [(96 + view, 64 - view) if view % 2 else (64 + view, 96 - view) for view in range(VIEWS)]
+    cameras = [pinhole(*size, 80.0 + view) for view, size in enumerate(sizes)]
+    write_photos(tmp_path / "room/images", cameras, NAMES)
+    if kind == "colmap":
+        write_model(tmp_path / "room/sparse/0", cameras, NAMES)
+    else:
+        write_nerfstudio(tmp_path / "room", cameras, [f"images/{name}" for name in NAMES])
+    scene = load_scene(tmp_path / "room")
+    require_painted(scene)
+    assert scene.train.cameras.sizes.tolist() == [list(size) for size in sizes[1:8]]
+    lengths = ("train.iterations=6", "train.refine_until=4", "schedule.max_views=3", "train.device=cpu")
+    asked = load_config("turbogs", lengths)
+    config = make_plan(asked, scene, torch.device("cpu")).apply(asked)
+    trainer = Trainer(config, scene, torch.device("cpu"))
+    trainer.initialise_maps()
+    before = trainer.maps.mean()
+    for _ in range(6):
+        trainer.step()
+    assert trainer.maps.mean() < before
+    assert np.isfinite(evaluate(trainer.gaussians, scene.test, Look(0, config.raster)).mean.psnr)

@@ -1,0 +1,220 @@
+"""LLFF captures: poses_bounds.npy beside images, or beside reduced copies alone."""
+
+import io
+import math
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.bounded_memory import outcome_within
+from helpers.painted import painted_photo, require_points_at_their_pixels
+from helpers.refusals import assert_refused
+from PIL import Image
+
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.errors import InputError
+
+FULL, FOCAL, NEAR, FAR = (120, 80), 90.0, 2.0, 10.0
+POINTS = np.array([[0.3, 0.0, -4.0], [-0.5, 0.4, -3.0], [0.0, -0.6, -6.0]])
+VIEWS = 9
+
+
+def axes_and_center(view: int) -> tuple[np.ndarray, np.ndarray]:
+    """([3, 3] rows right, up, backward, [3]) of cameras in front of the origin that look along -z, all a bit askew."""
+    turn, tilt = 0.05 * (view - 4), 0.04 * (view % 3)
+    backward = np.array([math.sin(turn) * math.cos(tilt), math.sin(tilt), math.cos(turn) * math.cos(tilt)])
+    right = np.cross([0.1, 1.0, 0.0], backward)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(backward, right), backward]), np.array([0.1 * view - 0.4, 0.05 * (view % 4), 0.0])
+
+
+def seen_at(view: int, size: tuple[int, int]) -> np.ndarray:
+    """[3, 2] where LLFF's camera sees the points in a photo of this size."""
+    (right, up, backward), center = axes_and_center(view)
+    offsets, focal = POINTS - center, FOCAL * size[0] / FULL[0]
+    depths = -offsets @ backward
+    return np.stack(
+        [0.5 * size[0] + focal * offsets @ right / depths, 0.5 * size[1] - focal * offsets @ up / depths], 1
+    )
+
+
+def table(views: int = VIEWS) -> np.ndarray:
+    """[V, 17] as LLFF's imgs2poses.py writes it."""
+    rows = []
+    for view in range(views):
+        (right, up, backward), center = axes_and_center(view)
+        hwf = np.array([FULL[1], FULL[0], FOCAL])
+        matrix = np.stack([-up, right, backward, center, hwf], axis=1)  # [3, 5]
+        rows.append(np.concatenate([matrix.ravel(), [NEAR + 0.1 * view, FAR]]))
+    return np.array(rows)
+
+
+def write_photos(folder: Path, size: tuple[int, int] = FULL, prefix: str = "IMG_") -> None:
+    folder.mkdir(parents=True)
+    for view in range(VIEWS):
+        Image.fromarray(painted_photo(size, seen_at(view, size))).save(folder / f"{prefix}{view:03}.png")
+
+
+def write_llff(folder: Path, **photos: tuple[int, int]) -> Path:
+    """Photos of the given sizes by the names of their folders; images at full size where nothing is given."""
+    for name, size in (photos or {"images": FULL}).items():
+        write_photos(folder / name, size, "IMG_" if name == "images" else "image")
+    np.save(folder / "poses_bounds.npy", table())
+    return folder
+
+
+def test_painted_points_are_where_the_cameras_see_them(tmp_path):
+    scene = load_scene(write_llff(tmp_path / "fern"))
+    require_points_at_their_pixels(scene, scene.train, POINTS)
+    require_points_at_their_pixels(scene, scene.test, POINTS)
+    assert scene.test.names == ("IMG_000.png", "IMG_008.png") and len(scene.train) == 7
+    (note,) = scene.notes
+    assert note == (
+        f"{tmp_path}/fern/poses_bounds.npy (LLFF): 9 photos 120x80 of images; "
+        "no points, so 50,000 random ones (seed 0) within the views at depths of 2 to 10"
+    )
+
+
+@pytest.mark.parametrize("size", [(30, 20), (30, 21), (29, 20)])
+def test_reduced_copies_alone(tmp_path, size):
+    """A side may be rounded either way."""
+    scene = load_scene(write_llff(tmp_path / "fern", images_4=(30, 20), images_8=(15, 10)))
+    require_points_at_their_pixels(scene, scene.train, POINTS)
+    assert "photos 30x20 of images_4;" in scene.notes[0] and scene.train.names[0] == "image001.png"
+    np.testing.assert_allclose(scene.train.cameras.Ks[0], [[22.5, 0, 15], [0, 22.5, 10], [0, 0, 1]])
+    for file in (tmp_path / "fern/images_4").iterdir():
+        Image.new("RGB", size).save(file)
+    width, height = size
+    expected = [[22.5 * width / 30, 0, width / 2], [0, 22.5 * height / 20, height / 2], [0, 0, 1]]
+    np.testing.assert_allclose(load_scene(tmp_path / "fern").train.cameras.Ks[0], expected, rtol=1e-6)
+
+
+def test_a_factor_counts_from_the_full_size(tmp_path):
+    """So images_4 are taken as they are for 4, and halved for 8."""
+    folder = write_llff(tmp_path / "fern", images_4=(32, 24))
+    rows = table()
+    rows[:, [4, 9]] = 96, 128
+    np.save(folder / "poses_bounds.npy", rows)
+    for factor, size in ((1, (32, 24)), (4, (32, 24)), (8, (16, 12))):
+        scene = load_scene(folder, factor=factor)
+        assert tuple(scene.train.cameras.sizes[0]) == size
+        np.testing.assert_allclose(scene.train.cameras.Ks[0, 0], [FOCAL * size[0] / 128, 0, 0.5 * size[0]])
+    with pytest.raises(InputError, match=r"--factor 2: the largest photos .* images_4: use --factor 4 or a multiple"):
+        load_scene(folder, factor=2)
+
+
+def test_copies_are_used_where_they_are_whole(tmp_path):
+    """By their order, for their names differ from those of the full-size photos."""
+    folder = write_llff(tmp_path / "fern", images=FULL, images_4=(30, 20))
+    scene = load_scene(folder, factor=4)
+    assert "of images_4;" in scene.notes[0] and tuple(scene.train.cameras.sizes[0]) == (30, 20)
+    require_points_at_their_pixels(scene, scene.train, POINTS)
+    assert "photos 120x80 of images;" in load_scene(folder).notes[0]
+    (folder / "images_4/image003.png").unlink()
+    scene = load_scene(folder, factor=4)
+    assert "of images;" in scene.notes[0] and tuple(scene.train.cameras.sizes[0]) == (30, 20)
+    for file in (folder / "images_4").iterdir():
+        Image.new("RGB", (40, 20)).save(file)
+    Image.new("RGB", (40, 20)).save(folder / "images_4/image003.png")
+    assert "of images;" in load_scene(folder, factor=4).notes[0]
+
+
+def test_points_are_seeded_and_within_the_views_and_bounds(tmp_path):
+    scene = load_scene(write_llff(tmp_path / "fern"))
+    assert scene.points.equal(load_scene(tmp_path / "fern").points) and len(scene.points) == 50_000
+    points = scene.frame.restore_points(scene.points.numpy())
+    seen = np.zeros(len(points), dtype=bool)
+    for view in range(VIEWS):
+        (right, up, backward), center = axes_and_center(view)
+        offsets = points - center
+        depths = -offsets @ backward
+        across, along = FOCAL * offsets @ right / depths, FOCAL * offsets @ up / depths
+        seen |= (np.abs(across) < 60.001) & (np.abs(along) < 40.001) & (depths > 1.999) & (depths < 10.001)
+    assert seen.all()
+    # Even in 1/depth: half of them lie nearer than the harmonic mean of the bounds.
+    assert np.mean(-points[:, 2] < 2 / (1 / 2.4 + 1 / FAR)) == pytest.approx(0.5, abs=0.05)
+
+
+def change_table(change):
+    def change_file(folder: Path) -> None:
+        rows = np.load(folder / "poses_bounds.npy")
+        result = change(rows)
+        np.save(folder / "poses_bounds.npy", rows if result is None else result)
+
+    return change_file
+
+
+def set_at(row, column, value):
+    def change(rows: np.ndarray) -> None:
+        rows[row, column] = value
+
+    return change_table(change)
+
+
+def drop_photos(folder: Path) -> None:
+    for file in (folder / "images").iterdir():
+        file.unlink()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (change_table(lambda rows: rows[:, :15]), "has 9x15 of float64 where N x 17 numbers .* imgs2poses.py"),
+        (change_table(lambda rows: rows.ravel()), "has 153 of float64 where N x 17"),
+        (change_table(lambda rows: rows.astype("S8")), r"has 9x17 of \|S8 where N x 17"),
+        (change_table(lambda rows: rows.astype(complex)), "has 9x17 of complex128 where N x 17"),
+        (change_table(lambda rows: rows.astype(object)), "is not a readable .npy file"),
+        (change_table(lambda rows: rows[:0]), "is not a readable .npy file|poses but"),
+        (change_table(lambda rows: rows[:8]), "has 8 poses but .*images has 9 photos: take out the photos without"),
+        (lambda folder: (folder / "images/IMG_002.png").unlink(), "images has 8 photos: 1 photos are missing there,"),
+        (drop_photos, "has poses_bounds.npy but no photos .*: put them into images"),
+        (set_at(3, 0, np.nan), "the pose in row 3 has numbers that are not finite: write it again"),
+        (set_at(3, 8, np.inf), "the pose in row 3 has numbers that are not finite"),
+        (set_at(5, slice(0, 15, 5), 2.0), "the pose in row 5 is not a rotation and a translation: write it again"),
+        (change_table(lambda rows: rows[:, [1, 0, *range(2, 17)]]), "the pose in row 0 is not a rotation"),
+        (set_at(2, 14, np.nan), "row 2 has a height, width or focal length that is not a positive number"),
+        (set_at(2, 14, -3.0), r"row 2 has a height, width or focal .* \(1 such rows\)"),
+        (set_at(slice(None), 9, 0.0), r"row 0 has a height, width .* \(9 such rows\)"),
+        (set_at(1, 15, 0.0), "row 1 has bounds of depth that are not 0 < near < far"),
+        (set_at(1, 15, 5e-324), "row 1 has bounds"),
+        (set_at(1, 16, 1.0), "row 1 has bounds"),
+        (set_at(1, 16, np.nan), "row 1 has bounds"),
+        (set_at(slice(None), 9, 60.0), "IMG_000.png is 120x80, no uniform scale of the 60x80 in poses_bounds"),
+        (
+            lambda folder: Image.new("RGB", (80, 120)).save(folder / "images/IMG_004.png"),
+            "IMG_004.png is 80x120, no uniform scale of the 120x80 in poses_bounds.npy: use the photos",
+        ),
+    ],
+)
+def test_what_is_refused(tmp_path, change, words):
+    folder = write_llff(tmp_path / "fern")
+    change(folder)
+    assert_refused(words, load_scene, folder)
+
+
+@pytest.mark.usefixtures("few_random_points")
+def test_damaged_files(tmp_path):
+    """Bytes changed or cut, a header that announces more than there is: refused in little memory, or finite numbers."""
+    folder = write_llff(tmp_path / "fern")
+    file = folder / "poses_bounds.npy"
+    content, choice, refused = file.read_bytes(), random.Random(0), 0
+    huge = io.BytesIO()
+    np.lib.format.write_array_header_1_0(huge, {"descr": "<f8", "fortran_order": False, "shape": (2**40, 17)})
+    zipped = io.BytesIO()
+    np.savez(zipped, table())
+    hostile = [huge.getvalue() + content[128:], zipped.getvalue(), b"", b"\x80\x04", content[:60]]
+    for case in range(200):
+        data = bytearray(hostile[case] if case < len(hostile) else content)
+        if case >= len(hostile):
+            for _ in range(choice.choice([1, 2, 8])):
+                # Every second case goes for the header.
+                data[choice.randrange(128 if case % 2 else len(data))] = choice.randrange(256)
+        file.write_bytes(data)
+        result = outcome_within(2**25, load_scene, folder)
+        refused += isinstance(result, InputError)
+        if isinstance(result, InputError):
+            continue
+        assert case >= len(hostile)
+        assert result.train.cameras.viewmats.isfinite().all() and result.points.isfinite().all()
+    assert 50 < refused < 200

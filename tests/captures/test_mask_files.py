@@ -1,0 +1,239 @@
+"""Masks of captures: where they are found, what they mean, and what is refused."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.framework_runs import tiny_capture
+from PIL import Image
+
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.errors import InputError
+
+SIZE = (48, 40)
+
+
+@pytest.fixture(scope="module")
+def unmasked(tmp_path_factory) -> Path:
+    return tiny_capture(tmp_path_factory.mktemp("masks"))
+
+
+@pytest.fixture
+def capture(unmasked, tmp_path) -> Path:
+    return shutil.copytree(unmasked, tmp_path / "capture")
+
+
+def half_mask(size=SIZE) -> np.ndarray:
+    """The left half, and one pixel of the right one."""
+    mask = np.zeros((size[1], size[0]), dtype=np.uint8)
+    mask[:, : size[0] // 2] = 255
+    mask[3, size[0] - 5] = 1
+    return mask
+
+
+def photos_of(capture: Path) -> list[Path]:
+    return sorted((capture / "images").iterdir())
+
+
+def write_masks(capture: Path, names, mask: np.ndarray, folder: str = "masks", mode: str | None = None) -> None:
+    (capture / folder).mkdir(exist_ok=True)
+    for name in names:
+        image = Image.fromarray(mask)
+        (image.convert(mode) if mode else image).save(capture / folder / name)
+
+
+def assert_masked(views, expected: np.ndarray) -> None:
+    for view in range(len(views)):
+        assert np.array_equal(views.mask(view).numpy(), expected)
+
+
+@pytest.mark.parametrize("convention", ["{stem}.png", "{stem}{suffix}.png"])
+@pytest.mark.parametrize("mode", [None, "1", "P", "RGB", "RGBA", "I;16"])
+def test_a_nonzero_pixel_counts(capture, convention, mode):
+    names = [convention.format(stem=photo.stem, suffix=photo.suffix) for photo in photos_of(capture)]
+    mask = half_mask()
+    if mode == "I;16":
+        write_masks(capture, names, mask.astype(np.uint16) * 256)
+    elif mode == "1":
+        write_masks(capture, names, mask > 0)
+    else:
+        write_masks(capture, names, mask, mode=mode)
+    scene = load_scene(capture)
+    assert_masked(scene.train, mask > 0)
+    assert_masked(scene.test, mask > 0)
+    assert scene.notes[-2] == f"masks of 8 of 8 photos, as {capture / 'masks' / names[0]}"
+    assert scene.notes[-1] == "8 photos have masked pixels, 49.9% of them"
+
+
+def left_half_as_jpeg(path: Path) -> None:
+    path.parent.mkdir(exist_ok=True)
+    Image.fromarray(np.where(half_mask() > 1, np.uint8(255), np.uint8(0))).save(path, format="JPEG")
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".jpeg", ".JPG", ".JPEG"])
+def test_masks_are_jpegs_too(capture, suffix):
+    for photo in photos_of(capture):
+        left_half_as_jpeg(capture / "masks" / f"{photo.stem}{suffix}")
+    assert_masked(load_scene(capture).train, half_mask() > 1)
+
+
+def test_photos_without_a_mask_are_whole(capture):
+    photos = photos_of(capture)
+    write_masks(capture, [f"{photos[3].stem}.png"], half_mask())
+    scene = load_scene(capture)
+    assert scene.test.masks is None and [scene.train.mask(view) is None for view in range(7)].count(False) == 1
+    assert np.array_equal(scene.train.mask(2), half_mask() > 0)
+    assert scene.notes[-2].endswith(f"; 7 photos without one are whole: {photos[0].name}, ...")
+    assert scene.notes[-1] == "1 photos have masked pixels, 49.9% of them"
+
+
+@pytest.mark.parametrize("folder", ["mask", "Masks", "mask_images", "images/MASK"])
+def test_a_folder_of_masks_of_another_name_is_named_and_not_used(capture, folder):
+    whole = load_scene(capture).notes
+    (capture / folder).mkdir()
+    assert load_scene(capture).notes == whole  # as it holds no images
+    write_masks(capture, [f"{photo.stem}.png" for photo in photos_of(capture) if photo.is_file()], half_mask(), folder)
+    scene = load_scene(capture)
+    assert scene.train.masks is None and len(scene.train) + len(scene.test) == 8
+    assert scene.notes[-1] == (
+        f"{capture / folder} is not used: masks are read from masks/; rename it if it holds the photos' masks"
+    )
+    (capture / folder).rename(capture / "masks")
+    assert_masked(load_scene(capture).train, half_mask() > 0)
+
+
+def test_views_that_are_masked_whole_are_left_out(capture):
+    photos = photos_of(capture)
+    write_masks(capture, [f"{photos[1].stem}.png", f"{photos[4].stem}.png"], np.zeros(SIZE[::-1], dtype=np.uint8))
+    scene = load_scene(capture)
+    assert len(scene.train) == 5 and photos[1].name not in scene.train.names and scene.train.masks is None
+    assert scene.notes[-1] == (
+        f"2 photos have masked pixels, 100.0% of them; 2 masked whole are left out: {photos[1].name}, ..."
+    )
+
+
+@pytest.mark.parametrize(("part", "views"), [("training", range(1, 8)), ("test", [0])])
+def test_a_split_that_is_masked_whole_is_refused(capture, part, views):
+    photos = photos_of(capture)
+    write_masks(capture, [f"{photos[view].stem}.png" for view in views], np.zeros(SIZE[::-1], dtype=np.uint8))
+    with pytest.raises(InputError, match=rf"all \d {part} photos are masked whole: .* mend the masks"):
+        load_scene(capture)
+
+
+def test_a_mask_of_another_size_is_refused(capture):
+    photo = photos_of(capture)[2]
+    write_masks(capture, [f"{photo.stem}.png"], half_mask((24, 20)))
+    with pytest.raises(InputError, match=rf"mask .*{photo.stem}.png is 24x20 but photo .*{photo.name} is 48x40: make"):
+        load_scene(capture)
+
+
+@pytest.mark.parametrize("content", [b"", b"no mask", b"\x89PNG\r\n\x1a\n\x00"])
+def test_an_unreadable_mask_is_named(capture, content):
+    (capture / "masks").mkdir()
+    name = f"{photos_of(capture)[2].stem}.png"
+    (capture / "masks" / name).write_bytes(content)
+    with pytest.raises(InputError, match=rf"cannot read the mask .*{name}: "):
+        load_scene(capture)
+
+
+def test_a_reduced_pixel_counts_if_all_of_it_does(capture):
+    mask = np.full(SIZE[::-1], 255, dtype=np.uint8)
+    mask[:, 21:] = 0  # within the 11th reduced column
+    mask[10, 2] = 0
+    write_masks(capture, [f"{photo.stem}.png" for photo in photos_of(capture)], mask)
+    expected = np.zeros((20, 24), dtype=bool)
+    expected[:, :10] = True
+    expected[5, 1] = False
+    assert_masked(load_scene(capture, factor=2).train, expected)
+
+
+@pytest.mark.parametrize("folder", ["masks", "masks_2"])
+def test_reduced_copies_of_photos_take_full_or_reduced_masks(capture, folder):
+    (capture / "images_2").mkdir()
+    for photo in photos_of(capture):
+        Image.open(photo).resize((24, 20)).save(capture / "images_2" / photo.name)
+    names = [f"{photo.stem}.png" for photo in photos_of(capture)]
+    expected = np.zeros((20, 24), dtype=np.uint8)
+    expected[4:, 2:9] = 255
+    write_masks(capture, names, expected if folder == "masks_2" else expected.repeat(2, 0).repeat(2, 1), folder)
+    if folder == "masks_2":
+        write_masks(capture, names, half_mask())  # not of these photos
+    assert_masked(load_scene(capture, factor=2).train, expected > 0)
+
+
+def transforms_capture(capture: Path, tmp_path: Path, **of_first) -> Path:
+    scene, folder = load_scene(capture), tmp_path / "transforms"
+    shutil.copytree(capture / "images", folder / "images")
+    flip = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+    frames = [
+        {
+            "file_path": f"images/{name}",
+            "transform_matrix": (torch.linalg.inv(viewmat.double()) @ flip).tolist(),
+            "mask_path": f"of people/{Path(name).stem}-mask.png",
+        }
+        for name, viewmat in zip(scene.train.names, scene.train.cameras.viewmats, strict=True)
+    ]
+    frames[1].update(of_first)
+    (folder / "of people").mkdir()
+    for frame in frames:
+        Image.fromarray(half_mask()).save(folder / "of people" / f"{Path(frame['file_path']).stem}-mask.png")
+    record = {"w": 48, "h": 40, "fl_x": 55.2, "fl_y": 55.2, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(record))
+    return folder
+
+
+def test_transforms_name_masks(capture, tmp_path):
+    folder = transforms_capture(capture, tmp_path)
+    scene = load_scene(folder)
+    assert_masked(scene.train, half_mask() > 0)
+    assert f"masks of 7 of 7 photos, as {folder}/of people" in scene.notes[-2]
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("absent.png", r"names the mask .*absent.png, which is not there: bring it back"),
+        (7, "mask_path of frame .* is not a path: write one"),
+        ("../../secret.png", "secret.png, which is not there"),
+    ],
+)
+def test_transforms_with_a_bad_mask_path_are_refused(capture, tmp_path, path, words):
+    folder = transforms_capture(capture, tmp_path, mask_path=path)
+    with pytest.raises(InputError, match=words):
+        load_scene(folder)
+
+
+def test_masks_are_undistorted_as_their_photos_are(capture, tmp_path):
+    """A photo that is white where its mask is, and black elsewhere, stays so."""
+    folder = transforms_capture(capture, tmp_path)
+    y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]]
+    disc = ((x - 20) ** 2 + (y - 18) ** 2 < 13**2).astype(np.uint8) * 255
+    for photo in (folder / "images").iterdir():
+        Image.fromarray(disc).convert("RGB").save(photo)
+        Image.fromarray(disc).save(folder / "of people" / f"{photo.stem}-mask.png")
+    content = json.loads((folder / "transforms.json").read_text()) | {"k1": -0.2, "k2": 0.01}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    scene = load_scene(folder)
+    train = scene.train
+    assert any(note.startswith("7 photos undistorted") for note in scene.notes)
+    photo = train.photos.image(0)[..., 0]
+    assert torch.equal(train.mask(0), photo == 1.0) and 0.1 < train.mask(0).float().mean() < 0.9
+
+
+def test_alpha_and_masks_of_one_capture_count_both(capture):
+    """Of a COLMAP capture alpha is a mask."""
+    photo = photos_of(capture)[1]
+    image = Image.open(photo).convert("RGBA")
+    alpha = np.full(SIZE[::-1], 9, dtype=np.uint8)
+    alpha[:7] = 0
+    image.putalpha(Image.fromarray(alpha))
+    image.save(photo, format="PNG")
+    write_masks(capture, [f"{photo.stem}.png"], half_mask())
+    shutil.copy(photo, photos_of(capture)[2])
+    scene = load_scene(capture)
+    assert scene.notes[-1].startswith("2 photos have masked pixels (1 by their alpha alone), ")
+    assert np.array_equal(scene.train.mask(0), (half_mask() > 0) & (alpha > 0))
+    assert not scene.train.photos.transparent

@@ -1,0 +1,140 @@
+"""Random points: where they are drawn, and their colours, which are those of the photos."""
+
+import numpy as np
+import pytest
+import torch
+
+from turbogs_plugin.captures.starting_points import (
+    colors_in_photos,
+    random_points,
+    shares_with_points,
+    starting_points,
+)
+from turbogs_plugin.masks import PixelMasks
+from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.types import Cameras
+
+VIEWS, SIZE, FOCAL = 24, (80, 60), 60.0
+TURNS = 2 * np.pi * np.arange(VIEWS) / VIEWS
+AROUND = np.stack([np.sin(TURNS), 0 * TURNS, np.cos(TURNS)], axis=1)
+"""[V, 3], a ring of radius 1 about the origin, y up."""
+QUARTER = np.linspace(0, np.pi / 2, VIEWS)
+LINE = np.arange(VIEWS)[:, None] * np.array([1.0, 0.0, 0.0])
+
+
+def poses(centers: np.ndarray, forwards: np.ndarray) -> np.ndarray:
+    """[V, 4, 4] camera to world, in OpenGL's axes."""
+    up = np.array([0.0, 1.0, 0.0])
+    matrices = np.tile(np.eye(4), (len(centers), 1, 1))
+    matrices[:, :3] = np.stack([np.cross(forwards, up), 0 * forwards + up, -forwards, centers], axis=2)
+    return matrices
+
+
+def cameras_of(centers: np.ndarray, forwards: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """World-to-camera matrices, intrinsics and sizes."""
+    viewmats = np.linalg.inv(poses(centers, forwards) @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    K = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]])
+    return viewmats, np.tile(K, (len(viewmats), 1, 1)), np.tile(SIZE, (len(viewmats), 1))
+
+
+@pytest.mark.parametrize(
+    ("cameras", "words"),
+    [
+        (cameras_of(AROUND, AROUND), "before the 24 cameras, which do not look at one thing"),
+        (
+            cameras_of(LINE, np.stack([np.sin(QUARTER), 0 * QUARTER, np.cos(QUARTER)], axis=1)),
+            "before the 24 cameras, which do not look at one thing",
+        ),
+        (
+            cameras_of(AROUND, np.where(np.arange(VIEWS)[:, None] % 2, 1, -1) * AROUND),
+            "of which 25,000 are about what the cameras look at, 25,000 before 12 of 24 cameras that do not see these",
+        ),
+        (cameras_of(AROUND + np.array([5e5, 100, 5e6]), AROUND), "before the 24 cameras, which do not look at one"),
+        # a rig of four cameras in each place
+        (
+            cameras_of(np.repeat(LINE, 4, axis=0), np.tile(AROUND[::6], (VIEWS, 1))),
+            "of which 22,917 are about what the cameras",
+        ),
+    ],
+    ids=["outward ring", "turning line", "inward and outward", "far from the origin", "rig"],
+)
+def test_every_view_has_points(cameras, words):
+    assert shares_with_points(random_points(cameras[0]), *cameras).min() == 0.0
+    points, said = starting_points(*cameras)
+    assert len(points) == 50_000 and said.startswith(words)
+    assert shares_with_points(points, *cameras).min() > 0.5
+    np.testing.assert_array_equal(points, starting_points(*cameras)[0])
+
+
+@pytest.mark.parametrize("centers", [AROUND, 0 * AROUND], ids=["inward ring", "on the spot"])
+def test_where_all_views_see_enough_the_points_are_those_about_it(centers):
+    cameras = cameras_of(centers, -AROUND)
+    points, said = starting_points(*cameras)
+    assert np.array_equal(points, random_points(cameras[0])) and said == "about what the cameras look at"
+
+
+def test_depths_follow_extent_and_spacing():
+    """Between half the extent of a ring of radius 1 and ten times it; nearer where cameras stand closer."""
+    for views, nearest in ((24, 0.5), (600, 0.1)):
+        turns = 2 * np.pi * np.arange(views) / views
+        ring = np.stack([np.sin(turns), 0 * turns, np.cos(turns)], axis=1)
+        points, _ = starting_points(*cameras_of(ring, ring))
+        distances = np.linalg.norm(points, axis=1)
+        assert 1 + nearest <= distances.min() < 1.05 + nearest and 9 < distances.max() < 1 + 10 / np.cos(0.7)
+
+
+def two_views() -> tuple[Cameras, Photos]:
+    """A 4x2 photo from the origin along z, and a 2x3 one of one colour from z = 10, looking back."""
+    viewmats = torch.eye(4).repeat(2, 1, 1)
+    viewmats[1, :3, :3], viewmats[1, 2, 3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0])), 10.0
+    Ks = torch.tensor([[[2.0, 0, 2], [0, 2, 1], [0, 0, 1]], [[1.0, 0, 1], [0, 1, 1.5], [0, 0, 1]]])
+    colors = torch.cat([torch.arange(24).view(8, 3), torch.full((6, 3), 100)]).to(torch.uint8)
+    sizes = np.array([[4, 2], [2, 3]])
+    return Cameras(viewmats, Ks, sizes), Photos(colors, sizes)
+
+
+def test_the_mean_of_the_pixels_that_see_a_point():
+    points = torch.tensor(
+        [
+            [0.6, -0.4, 1.0],  # (3.2, 0.2) of the first: its pixel 3; (0.93, 1.46) of the other
+            [-0.9, 0.4, 1.0],  # (0.2, 1.8): pixel 4; and the other
+            [5.0, 0.0, 9.9],  # (3.01, 1.0): pixel 7 of the first alone
+            [0.0, 50.0, 1.0],  # beside both
+        ]
+    )
+    found = colors_in_photos(points, *two_views())
+    expected = [[54, 55, 56], [56, 56, 57], [21, 22, 23]]
+    assert found.dtype == torch.uint8
+    np.testing.assert_allclose(found[:3], expected, atol=1)
+    np.testing.assert_allclose(found[3], [(9 + 12 + 21 + 200 + 5 * shift) / 5 for shift in (0, 0.6, 1.2)], atol=1)
+
+
+def test_masked_pixels_give_no_colour():
+    cameras, photos = two_views()
+    keep = [torch.ones(2, 4, dtype=torch.bool), torch.zeros(3, 2, dtype=torch.bool)]
+    points = torch.tensor([[0.6, -0.4, 1.0]])  # pixel 3 of the first, which is 9, 10, 11
+    assert colors_in_photos(points, cameras, photos, PixelMasks.from_images(keep)).tolist() == [[9, 10, 11]]
+    keep[0][0, 3] = False  # then the mean of nothing that was seen
+    assert colors_in_photos(points, cameras, photos, PixelMasks.from_images(keep)).tolist() == [[128, 128, 128]]
+
+
+def test_transparent_pixels_count_by_their_alpha():
+    cameras, photos = two_views()
+    alphas = torch.tensor([51] * 8 + [204] * 6)[:, None]  # 0.2 and 0.8; pixel 3 of the first has 50, 100, 0 there
+    colors = torch.cat([photos.colors.long() * alphas // 255, alphas], dim=1).to(torch.uint8)
+    colors[3, :3] = torch.tensor([10, 20, 0])
+    found = colors_in_photos(torch.tensor([[0.6, -0.4, 1.0]]), cameras, Photos(colors, photos.sizes))
+    assert found.tolist() == [[90, 100, 80]]
+
+
+def test_points_that_no_photo_sees_are_grey():
+    assert colors_in_photos(torch.tensor([[0.0, 50.0, 1.0]]), *two_views()).tolist() == [[128, 128, 128]]
+
+
+def test_no_more_photos_are_looked_at_than_say_anything_new():
+    """Of 100 photos of their own number, 32 evenly spread ones."""
+    cameras = Cameras(torch.eye(4).repeat(100, 1, 1), torch.eye(3).repeat(100, 1, 1), np.ones((100, 2), dtype=np.int64))
+    photos = Photos(torch.arange(100, dtype=torch.uint8)[:, None].repeat(1, 3), cameras.sizes)
+    views = np.linspace(0, 99, 32).round()
+    found = colors_in_photos(torch.tensor([[0.5, 0.5, 1.0]]), cameras, photos)
+    assert found[0, 0].item() == round(float(views.mean()))

@@ -1,0 +1,457 @@
+"""transforms.json of nerfstudio and instant-ngp."""
+
+import json
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.refusals import assert_refused
+from PIL import Image
+
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.errors import InputError
+
+SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[3] / "shared" / "scenes"))
+TARGET = np.array([3.0, -1.0, 2.0])
+
+
+def camera_to_world(angle: float) -> np.ndarray:
+    """OpenGL's: x right, y up, z backward; on a ring of radius 4 about the target, looking at it, z up."""
+    center = TARGET + np.array([4 * math.cos(angle), 4 * math.sin(angle), 1.0])
+    backward = (center - TARGET) / np.linalg.norm(center - TARGET)
+    right = np.cross([0.0, 0.0, 1.0], backward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(backward, right), backward, center], axis=1)
+    return pose
+
+
+def write_transforms(folder: Path, views: int = 9, mode: str = "RGB", **content) -> Path:
+    """Photos images/f0.png .. of 20x10, one colour each, and a transforms.json; a None in `content` drops it."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for view in range(views):
+        color = (10 * view, 200, 30, 128) if mode == "RGBA" else (10 * view, 200, 30)
+        Image.new(mode, (20, 10), color).save(folder / "images" / f"f{view}.png")
+        pose = np.round(camera_to_world(0.5 * view), 7).tolist()
+        frames.append({"file_path": f"./images/f{view}.png", "transform_matrix": pose})
+    everything = {"w": 20, "h": 10, "fl_x": 25.0, "fl_y": 26.0, "cx": 9.5, "cy": 5.5, "frames": frames} | content
+    kept = {key: value for key, value in everything.items() if value is not None}
+    (folder / "transforms.json").write_text(json.dumps(kept))
+    return folder
+
+
+def edit(folder: Path, function) -> None:
+    content = json.loads((folder / "transforms.json").read_text())
+    function(content)
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def test_axes_intrinsics_and_photos(tmp_path):
+    scene = load_scene(write_transforms(tmp_path / "cup"))
+    assert scene.test.names == ("f0.png", "f8.png") and len(scene.train) == 7
+    np.testing.assert_allclose(scene.train.cameras.Ks[0], [[25, 0, 9.5], [0, 26, 5.5], [0, 0, 1]])
+    expected = [camera_to_world(0.5 * view)[:3, 3] for view in range(1, 8)]
+    np.testing.assert_allclose(scene.frame.restore_points(scene.train.cameras.centers.numpy()), expected, atol=1e-5)
+    # The target is straight ahead; a point above it (z is up) is above in the image, at smaller y.
+    target, above = scene.frame.normalise_points(np.stack([TARGET, TARGET + np.array([0, 0, 0.5])]))
+    for viewmat in scene.train.cameras.viewmats.double().numpy():
+        ahead = viewmat[:3, :3] @ target + viewmat[:3, 3]
+        np.testing.assert_allclose(ahead[:2], 0, atol=1e-6)
+        assert ahead[2] * scene.frame.scale == pytest.approx(math.sqrt(17), rel=1e-5)
+        assert (viewmat[:3, :3] @ above + viewmat[:3, 3])[1] < -0.05
+        assert np.linalg.det(viewmat[:3, :3]) == pytest.approx(1)
+    assert scene.train.photos.colors[0].tolist() == [10, 200, 30]
+
+
+def test_camera_angle_and_sizes_from_the_photos(tmp_path):
+    """As instant-ngp and blender write them: no w, h, fl_x; names without a suffix."""
+    missing = dict.fromkeys(["w", "h", "fl_x", "fl_y", "cx", "cy"])
+    folder = write_transforms(tmp_path / "cup", camera_angle_x=0.8, **missing)
+    edit(folder, lambda content: [frame.update(file_path=frame["file_path"][:-4]) for frame in content["frames"]])
+    scene = load_scene(folder, factor=2)
+    assert scene.train.names[0] == "f1.png"
+    focal = 0.5 * 10 / math.tan(0.4)
+    np.testing.assert_allclose(scene.train.cameras.Ks[0], [[focal, 0, 5], [0, focal, 2.5], [0, 0, 1]], rtol=1e-6)
+
+
+def test_a_frame_overrides_what_stands_for_all(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    edit(folder, lambda content: content["frames"][3].update(fl_x=99.0, w=12, h=10, cx=6.0))
+    Image.new("RGB", (12, 10)).save(folder / "images" / "f3.png")
+    scene = load_scene(folder)
+    np.testing.assert_allclose(scene.train.cameras.Ks[2], [[99, 0, 6], [0, 26, 5.5], [0, 0, 1]])
+    assert scene.train.cameras.sizes[1:4].tolist() == [[20, 10], [12, 10], [20, 10]]
+
+
+@pytest.mark.parametrize("key", ["K", "intrinsic_matrix"])
+def test_intrinsics_as_a_matrix(tmp_path, key):
+    """Of each frame, 3x3 or 4x4 as NeuS2 writes it; a small skew is left by decompositions of projections."""
+    none = dict.fromkeys(["fl_x", "fl_y", "cx", "cy"])
+    folder = write_transforms(tmp_path / "cup", **none)
+
+    def change(content):
+        for view, frame in enumerate(content["frames"]):
+            K = np.eye(3 if key == "K" else 4)
+            K[:2, :3] = [[25 + view, 1e-4, 9.5], [0, 26, 5.5]]
+            frame[key] = K.tolist()
+
+    edit(folder, change)
+    scene = load_scene(folder)
+    np.testing.assert_allclose(scene.train.cameras.Ks[2], [[28, 0, 9.5], [0, 26, 5.5], [0, 0, 1]])
+    edit(folder, lambda content: content.update(fl_x=40.0))  # comes first
+    np.testing.assert_allclose(load_scene(folder).train.cameras.Ks[2], [[40, 0, 10], [0, 40, 5], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("K", "words"),
+    [
+        ("wide", r"K of ./images/f0.png is 'wide': it must be 3x3 or 4x4 finite numbers"),
+        ([[25, 0], [0, 25]], "must be 3x3 or 4x4 finite numbers"),
+        ([[25, 0, 10], [0, 25, 5], [0, 1]], "must be 3x3 or 4x4 finite numbers"),
+        ([[25, 0, 10], [0, math.nan, 5], [0, 0, 1]], "must be 3x3 or 4x4 finite numbers"),
+        ([[25, 0, 10], [0, -25, 5], [0, 0, 1]], "with positive focal lengths"),
+        ([[25, 3, 10], [0, 25, 5], [0, 0, 1]], "it must be ..fx, 0, cx., .0, fy, cy., .0, 0, 1.., with"),
+        ([[25, 0, 0], [0, 25, 0], [10, 5, 1]], "it must be ..fx, 0, cx., .0, fy, cy., .0, 0, 1.., with"),
+    ],
+)
+def test_matrices_that_are_no_intrinsics(tmp_path, K, words):
+    folder = write_transforms(tmp_path / "cup", fl_x=None, K=K)
+    assert_refused(words, load_scene, folder)
+
+
+def test_transparency_is_opacity(tmp_path):
+    """Colours are kept as multiplied by alpha, and shown on any background."""
+    scene = load_scene(write_transforms(tmp_path / "cup", mode="RGBA"))
+    np.testing.assert_allclose(scene.train.photos.colors[0], [5, 100, 15, 128], atol=1)
+    for background in ((0.0, 0.0, 0.0), (1.0, 0.5, 0.0)):
+        expected = 128 / 255 * np.array([10, 200, 30]) / 255 + 127 / 255 * np.array(background)
+        np.testing.assert_allclose(scene.train.photos.image(0, background)[0, 0], expected, atol=0.004)
+
+
+def test_random_points_are_seeded_and_about_what_the_cameras_see(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    scene, again = load_scene(folder), load_scene(folder)
+    assert np.array_equal(scene.points, again.points) and len(scene.points) == 50_000
+    points = scene.frame.restore_points(scene.points.numpy())
+    np.testing.assert_allclose(points.mean(axis=0), TARGET, atol=0.05)
+    assert np.ptp(points, axis=0) == pytest.approx([math.sqrt(17)] * 3, rel=1e-2)
+
+
+@pytest.mark.parametrize("body", ["ascii", "binary"])
+def test_points_from_a_ply(tmp_path, body):
+    folder = write_transforms(tmp_path / "cup", ply_file_path="sparse_pc.ply")
+    table = np.array(
+        [(1.5, 2, 3, 10, 20, 30), (4, 5, -6, 40, 50, 60)],
+        dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")],
+    )
+    kind = {"ascii": "ascii", "binary": "binary_little_endian"}[body]
+    header = f"ply\nformat {kind} 1.0\ncomment made by a test\nelement vertex 2\n"
+    header += "".join(f"property {kind} {name}\n" for kind, names in (("float", "xyz"),) for name in names)
+    header += "property uint8 red\nproperty uint8 green\nproperty uint8 blue\nend_header\n"
+    text = "\n".join(" ".join(str(value) for value in row) for row in table.tolist()).encode()
+    (folder / "sparse_pc.ply").write_bytes(header.encode() + (text if body == "ascii" else table.tobytes()))
+    scene = load_scene(folder)
+    np.testing.assert_allclose(scene.frame.restore_points(scene.points.numpy()), [[1.5, 2, 3], [4, 5, -6]], atol=1e-5)
+    assert scene.point_colors.tolist() == [[10, 20, 30], [40, 50, 60]]
+    if body == "ascii":
+        (folder / "sparse_pc.ply").write_bytes(header.encode() + text.replace(b"40", b"forty"))
+        with pytest.raises(InputError, match=r"sparse_pc\.ply is not a whole \.ply file"):
+            load_scene(folder)
+
+
+def write_colored_points(folder: Path, kind: str, colors: list, comment: str = "") -> Path:
+    """A capture with points of red, green and blue of a type by numpy's name."""
+    write_transforms(folder, ply_file_path="points.ply")
+    rows = [((i, 1, 2), tuple(color)) for i, color in enumerate(colors)]
+    table = np.array(rows, dtype=[("place", "<f4", 3), ("color", np.dtype(kind).newbyteorder("<"), 3)])
+    header = f"ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex {len(colors)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "".join(f"property {kind} {channel}\n" for channel in ("red", "green", "blue"))
+    (folder / "points.ply").write_bytes(f"{header}end_header\n".encode() + table.tobytes())
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "read"),
+    [
+        ("uint8", [[0, 128, 255]], [0, 128, 255]),
+        ("float32", [[0.5, 0.25, 1.0]], [128, 64, 255]),
+        ("float64", [[0.5, -0.1, 1.2]], [128, 0, 255]),  # a bit beyond black and white
+        ("float32", [[127.6, 64, 255]], [128, 64, 255]),
+        ("uint16", [[0, 256, 65535]], [0, 1, 255]),
+        ("uint16", [[0, 128, 255]], [0, 128, 255]),
+        ("int32", [[-1, 128, 255]], [0, 128, 255]),
+    ],
+)
+def test_colors_of_points_are_scaled_by_their_type(tmp_path, kind, given, read):
+    scene = load_scene(write_colored_points(tmp_path / "cup", kind, given))
+    assert scene.point_colors.tolist() == [read]
+
+
+def test_colors_of_points_that_are_not_finite_are_refused(tmp_path):
+    folder = write_colored_points(tmp_path / "cup", "float32", [[0.5, 0.5, 0.5], [0.5, math.nan, 0.5]])
+    assert_refused(r"points\.ply: the colours of 1 of 2 points are not finite: export it again", load_scene, folder)
+
+
+def set_pose(value):
+    return lambda content: content["frames"][2].update(transform_matrix=value)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda content: content.update(camera_model="EQUIRECTANGULAR"),
+            "f0.png is 'EQUIRECTANGULAR': known are OPENCV",
+        ),
+        (lambda content: content.update(camera_model=[3]), r"f0.png is '\[3\]': known are"),
+        (lambda content: content.update(k5=0.1), "OPENCV camera of f0.png has k5, which"),
+        (
+            lambda content: content.update(is_fisheye=True, p1=0.1, p2=0.1),
+            "FISHEYE camera of f0.png has p1 and p2, which",
+        ),
+        (lambda content: content.update(k1="much"), "k1 is 'much': it must be a finite number"),
+        (lambda content: content["frames"][4].update(k1=-1e9), "f4.png is OPENCV with parameters that are not those"),
+        (lambda content: content.update(fl_x="wide"), "fl_x is 'wide'"),
+        (lambda content: content.update(fl_x=math.nan), "fl_x is 'nan'"),
+        (lambda content: content.update(fl_x=10**400), "fl_x is"),
+        (lambda content: content.update(fl_x=-1.0), "positive focal lengths .*: export or reconstruct it again"),
+        (lambda content: content.pop("fl_x"), "neither fl_x nor a camera_angle_x"),
+        (lambda content: content.update(w=25), "f0.png is 20x10 but its camera is 25x10: it was cropped or turned"),
+        (lambda content: content.update(w=2**60), "size of f0.png .*: write the photo's as w and h"),
+        (lambda content: content.update(frames=[]), "no list of frames"),
+        (lambda content: content.update(frames=3), "no list of frames"),
+        (lambda content: content.update(frames=content["frames"][:2]), "has 2 images"),
+        (lambda content: content["frames"].append(content["frames"][0]), "two frames for 'images/f0.png': take"),
+        (lambda content: content["frames"][0].pop("file_path"), "a frame without a file_path"),
+        (
+            lambda content: [frame.update(file_path=f"/home/me/none{i}") for i, frame in enumerate(content["frames"])],
+            r"names 9 photos, of which 9 are missing in .*/cup \(/home/me/none0, ...\): at least 3",
+        ),
+        (
+            lambda content: [frame.update(file_path=f"none{i}.png") for i, frame in enumerate(content["frames"][2:])],
+            r"names 9 photos, of which 7 are missing in .* \(none0.png, ...\): at least 3",
+        ),
+        (lambda content: content.update(ply_file_path="../points.ply"), "points.ply is not there: bring it back"),
+        (lambda content: content.update(ply_file_path=3), "ply_file_path is not a path: write one, or take it out"),
+        (lambda content: content.update(ply_file_path="points.ply"), "points.ply is not there: bring it back, or take"),
+        (set_pose(None), "f2.png' has no transform_matrix"),
+        (set_pose([[1, 2], [3]]), "f2.png' has no transform_matrix"),
+        (set_pose((np.eye(4) * math.nan).tolist()), "f2.png' has numbers that are not finite"),
+        (set_pose((np.eye(4) * 2).tolist()), "f2.png' is not a rotation"),
+        (set_pose(np.diag([1, 1, -1, 1]).tolist()), "f2.png' is not a rotation"),
+    ],
+)
+def test_what_is_refused(tmp_path, change, words):
+    folder = write_transforms(tmp_path / "cup")
+    edit(folder, change)
+    assert_refused(words, load_scene, folder)
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        "images\\f{}.png",
+        ".\\images\\f{}.png",
+        "C:\\Users\\me\\cup\\images\\f{}.png",
+        "/home/me/cup/images/f{}.png",
+        "../cup/images/f{}.png",
+        "images/f{}.PNG",
+        "/home/me/cup/images/f{}",
+    ],
+)
+def test_paths_of_the_machine_that_wrote_it(tmp_path, written):
+    """Of Windows, absolute, or from another folder: the end that is there counts."""
+    folder = write_transforms(tmp_path / "cup")
+    (folder / "f3.png").write_bytes((folder / "images" / "f0.png").read_bytes())  # a shorter end
+    (folder / "shade.png").write_bytes((folder / "images" / "f0.png").read_bytes())
+
+    def change(content):
+        for view, frame in enumerate(content["frames"]):
+            frame["file_path"] = written.format(view)
+            frame["mask_path"] = "D:\\cup\\shade.png"
+
+    edit(folder, change)
+    scene = load_scene(folder)
+    assert scene.test.names == ("f0.png", "f8.png") and len(scene.train) == 7
+    np.testing.assert_allclose(scene.train.photos.image(2)[0, 0] * 255, [30, 200, 30], atol=1e-4)
+    assert "masks of 9 of 9 photos" in scene.notes[1]
+
+
+def test_a_mark_at_the_beginning_of_the_file(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    source = folder / "transforms.json"
+    source.write_bytes(b"\xef\xbb\xbf" + source.read_bytes())
+    assert len(load_scene(folder).train) == 7
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2", "[" * 100_000, "\x00\xff", "3"])
+def test_files_that_are_not_such_json(tmp_path, text):
+    folder = write_transforms(tmp_path / "cup")
+    (folder / "transforms.json").write_text(text, encoding="latin-1")
+    assert_refused(r"(readable JSON: .*|no list of frames).* again", load_scene, folder)
+
+
+def test_frames_without_a_photo_are_left_out_and_counted(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    for view in (1, 4):
+        (folder / "images" / f"f{view}.png").unlink()
+    edit(folder, lambda content: content["frames"][4].pop("transform_matrix"))  # nothing is asked of what is left out
+    scene = load_scene(folder)
+    assert scene.test.names == ("f0.png",)
+    assert scene.train.names == ("f2.png", "f3.png", "f5.png", "f6.png", "f7.png", "f8.png")
+    assert "7 photos, no points, so 50,000 random ones" in scene.notes[0]
+    assert scene.notes[1:] == ("2 of 9 frames are left out, their photos do not exist: images/f1.png, ...",)
+
+
+@pytest.mark.parametrize(
+    "written", ["/home/me/cup/images/f{}.png", "../cup/images/f{}.png", "D:\\cup\\images\\f{}.png"]
+)
+def test_an_absent_photo_of_another_machine_is_left_out_like_any(tmp_path, written):
+    """Nor is a file taken that its path names outside of the capture."""
+    folder = write_transforms(tmp_path / "cup")
+    (folder / "images/f5.png").unlink()
+    (tmp_path / "f7.png").write_bytes((folder / "images/f7.png").read_bytes())
+    (folder / "images/f7.png").unlink()
+
+    def change(content):
+        for view, frame in enumerate(content["frames"]):
+            frame["file_path"] = written.format(view)
+        content["frames"][7]["file_path"] = str(tmp_path / "f7.png")
+
+    edit(folder, change)
+    scene = load_scene(folder)
+    assert (*scene.test.names, *scene.train.names) == ("f0.png", *(f"f{view}.png" for view in (1, 2, 3, 4, 6, 8)))
+    assert scene.notes[1] == f"2 of 9 frames are left out, their photos do not exist: {written.format(5)}, ...".replace(
+        "\\", "/"
+    )
+
+
+@pytest.mark.parametrize("written", ["images/f{}.jpeg", "/home/me/cup/images/f{}.JPG", "images\\f{}.tif"])
+def test_photos_with_another_suffix(tmp_path, written):
+    folder = write_transforms(tmp_path / "cup", test_filenames=[written.format(3)])
+    edit(folder, lambda content: [f.update(file_path=written.format(i)) for i, f in enumerate(content["frames"])])
+    scene = load_scene(folder)
+    assert scene.test.names == ("f3.png",) and len(scene.train) == 8
+    assert scene.notes[1].startswith("9 photos have another suffix than in transforms.json: images/f0.png is taken for")
+
+
+@pytest.mark.parametrize(
+    ("written", "lie", "folders"),
+    [
+        ("images/f{}.png", "f{}.png", "cup"),
+        ("images/f{}.png", "rgb/f{}.png", "cup/rgb"),
+        ("images/f{}.jpg", "DJI_001/f{}.PNG", "cup/DJI_001"),
+        ("/home/me/all/f{}", "out/rgb/f{}.png", "cup/out/rgb"),
+        ("..\\photos\\f{}.png", "images/f{}.png", ""),
+        ("all/cam{}/f.png", "rgb/cam{}/f.png", "cup/rgb/cam0, {}/cup/rgb/cam1, {}/cup/rgb/cam2, ..."),
+    ],
+)
+def test_photos_in_another_folder_are_found_by_their_names(tmp_path, written, lie, folders):
+    mask = "shade/f3.png"
+    folder = write_transforms(tmp_path / "cup", test_filenames=[written.format(3)])
+    for view in range(9):
+        (folder / lie.format(view)).parent.mkdir(parents=True, exist_ok=True)
+        (folder / f"images/f{view}.png").rename(folder / lie.format(view))
+    for beside in ("shade", "depth"):
+        (folder / beside).mkdir()
+        (folder / beside / "f3.png").write_bytes((folder / lie.format(3)).read_bytes())
+    edit(folder, lambda content: [f.update(file_path=written.format(i)) for i, f in enumerate(content["frames"])])
+    edit(folder, lambda content: content["frames"][3].update(mask_path=mask))
+    scene = load_scene(folder)
+    assert len(scene.train) == 8
+    np.testing.assert_allclose(scene.test.photos.image(0)[0, 0] * 255, [30, 200, 30], atol=1e-4)
+    if folders:
+        assert scene.notes[1] == f"photos in {tmp_path}/" + folders.replace("{}", str(tmp_path))
+
+
+def test_photos_in_another_folder_that_may_be_others_are_not_taken(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    (folder / "images").rename(folder / "old")
+    (folder / "rgb").mkdir()
+    (folder / "rgb/f2.png").write_bytes((folder / "old/f2.png").read_bytes())
+    missing = r"names 9 photos, of which 9 are missing in .*/cup \(images/f0.png, ...\): at least 3 are needed; "
+    assert_refused(missing + r"copy the photos there \(f2.png is in .*/cup/old, .*/cup/rgb\)$", load_scene, folder)
+    (folder / "rgb/f2.png").unlink()
+    edit(folder, lambda content: content["frames"][1].update(file_path="other/f0.png"))
+    assert_refused(r" \(.*/cup/old/f0.png is of several names\)$", load_scene, folder)
+    for file in (folder / "old").iterdir():
+        file.unlink()
+    assert_refused(r"9 are missing in .*/cup \(images/f0.png.*; copy the photos there$", load_scene, folder)
+
+
+def test_neighbours_with_another_suffix_that_are_no_photos(tmp_path):
+    """Not what lies beside photos that are there, what another frame names, or one of two."""
+    folder = write_transforms(tmp_path / "cup")
+    photo = (folder / "images/f4.png").read_bytes()
+    (folder / "images/f4.png").unlink()
+    for beside in ("f3.jpg", "f4.jpg"):
+        (folder / "images" / beside).write_bytes(photo)
+    left_out = "1 of 9 frames are left out, their photos do not exist: images/f4.png, ..."
+    assert load_scene(folder).notes[1] == left_out
+    (folder / "images/f3.jpg").unlink()
+    assert load_scene(folder).notes[1].startswith("1 photos have another suffix than in transforms.json: images/f4.jpg")
+    (folder / "images/f4.JPEG").write_bytes(photo)
+    assert load_scene(folder).notes[1] == left_out
+    (folder / "images/f4.JPEG").unlink()
+    edit(folder, lambda content: content["frames"].append({**content["frames"][0], "file_path": "images/f4.jpg"}))
+    assert load_scene(folder).notes[1] == left_out.replace("of 9", "of 10")
+
+
+def listed(*views: int) -> list[str]:
+    return [f"./images/f{view}.png" for view in views]
+
+
+@pytest.mark.parametrize(
+    ("lists", "train", "test", "said"),
+    [
+        ({"train": (0, 1, 2, 3), "val": (4, 5), "test": (6, 7)}, "0123", "67", "6 photos, its own split, 4 training"),
+        ({"train": (0, 1, 2, 3), "val": (4, 5)}, "0123", "45", "2 test photos (val_filenames), 3 others not used"),
+        ({"train": (0, 1, 2, 3), "val": (4, 5), "test": ()}, "0123", "45", "(val_filenames), 3 others"),
+        ({"train": (8, 1, 2)}, "128", "034567", "6 test photos (in no train_filenames), "),
+        ({"test": (8,)}, "01234567", "8", "8 training and 1 test photos (test_filenames), "),
+        ({"test": (8,), "val": (7,)}, "0123456", "8", "1 test photos (test_filenames), 1 others not used"),
+        ({"train": (0, 1, 2), "val": (3, 4), "test": (3, 4)}, "012", "34", "4 others not used"),
+    ],
+)
+def test_lists_of_file_names_are_the_split(tmp_path, lists, train, test, said):
+    """As nerfstudio reads them; photos in neither part are not even looked for."""
+    content = {f"{part}_filenames": listed(*views) for part, views in lists.items()}
+    folder = write_transforms(tmp_path / "cup", **content)
+    for view in set(range(9)) - {int(view) for view in train + test}:
+        (folder / "images" / f"f{view}.png").unlink()
+    scene = load_scene(folder, test_every=2)
+    assert scene.train.names == tuple(f"f{view}.png" for view in train)
+    assert scene.test.names == tuple(f"f{view}.png" for view in test)
+    assert said in scene.notes[0]
+
+
+def test_names_of_a_split_are_those_of_frames_without_suffix_too(tmp_path):
+    folder = write_transforms(tmp_path / "cup", test_filenames=["images/f3", "images/f5.png"])
+    edit(folder, lambda content: [frame.update(file_path=frame["file_path"][:-4]) for frame in content["frames"]])
+    assert load_scene(folder).test.names == ("f3.png", "f5.png")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"test_filenames": ["images/f3.png", "images/g.png", "h.png"]}, "names 'images/g.png' and 1 more, which no"),
+        ({"test_filenames": ["images/f3.png", "../f1.png"]}, "names '../f1.png', which no frame has"),
+        ({"val_filenames": "images/f3.png"}, "val_filenames is no list of file names"),
+        ({"train_filenames": [1]}, "train_filenames is no list of file names"),
+        ({"train_filenames": [], "test_filenames": []}, "train_filenames and test_filenames are empty"),
+        ({"train_filenames": [], "test_filenames": listed(1)}, "leave no photo to train on"),
+        ({"train_filenames": listed(*range(9))}, "leave no photo to test on"),
+        ({"train_filenames": listed(1, 2, 3), "test_filenames": listed(3, 4)}, r"1 photos are in .* \(images/f3.png\)"),
+        ({"train_filenames": listed(1, 2), "test_filenames": listed(3, 4)}, "2 training images: at least 3"),
+        ({"test_filenames": listed(0)}, "none of its 1 test photos is in"),
+    ],
+)
+def test_a_split_that_cannot_be_is_one_line(tmp_path, content, message):
+    folder = write_transforms(tmp_path / "cup", **content)
+    if content == {"test_filenames": listed(0)}:
+        (folder / "images" / "f0.png").unlink()
+    assert_refused(message, load_scene, folder)

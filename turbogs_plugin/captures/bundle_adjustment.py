@@ -1,0 +1,373 @@
+"""Bundle adjustment: each photo's own pinhole camera, from where the photo shows the points of a reconstruction.
+
+Reconstructions give all photos of a camera the same lens. A phone's or a drone's photos are not of one: the stabiliser
+shifts lens and sensor, focusing changes the focal length, and a rolling shutter shears what moves. The errors are up to
+half a pixel and systematic across a photo, so photos contradict one another, and a model of them is blurred. Here each
+photo gets its own pose, focal lengths and principal point: cameras and points in turn, by Gauss-Newton steps on squares
+that are reweighted by Cauchy's rule (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000).
+
+A prior holds cameras to those that were given: a normal distribution of ten parameters, whose covariance is learnt from
+all photos by expectation-maximisation. So where one lens is right for all of them, cameras stay what they were, however
+few points a photo shows.
+
+All is float64 on the CPU, and the same to the bit in every run, so that a resumed training has the same cameras.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from turbogs_plugin.scene.scene import Observations
+
+ROUNDS, CAMERA_STEPS, POINT_STEPS = 6, 2, 1
+RESECTION_STEPS = 10
+PRIOR = 0.006
+"""Standard deviation of every parameter of a camera before any is learnt, in the units of `Pinholes.moved`: four to six
+pixels at the edge of a photo of 1200."""
+SMALLEST_VARIANCE = 1e-14
+"""Smallest variance in the prior, so that it can be inverted."""
+POINT_DAMPING = 1e-4
+"""Damping of a point's normal equations, relative to their trace: a point stays in a direction that no photo tells."""
+FEWEST_OBSERVATIONS = 30
+"""A photo with fewer keeps its camera: three a parameter."""
+FINEST = 0.02
+"""Pixels: errors below are not taken for noise of the features, however exact a reconstruction is."""
+FARTHEST_MATCH = 0.02
+"""Share of a photo's width: photos are others than the reconstructed ones where half of the points are farther from
+where photos show them."""
+PARAMETERS = 10
+DERIVATIVES = (
+    ((0, 4, -1), (1, 0, 1), (1, 3, 1), (2, 2, -1), (3, 6, 1), (5, 7, -1), (6, 1, 1)),
+    ((0, 0, -1), (0, 5, -1), (1, 4, 1), (2, 1, 1), (4, 6, 1), (5, 8, -1), (7, 2, 1)),
+)
+"""Derivatives of a pixel's x and y by parameters of `Pinholes.moved` but the principal point: (parameter, function of
+`_Adjustment._camera_sums`, sign), in units of the focal length, and from function 6 on of the depth."""
+UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+"""Rows and columns of the entries of a symmetric 3x3 matrix that are computed."""
+CHUNK = 30_000
+"""Observations at once: few large operations, whose results stay in the processor's cache."""
+
+
+@dataclass(frozen=True)
+class Pinholes:
+    """V cameras in float64.
+
+    Args:
+        rotations: [V, 3, 3], world to camera.
+        translations: [V, 3].
+        focal: [V, 2], pixels.
+        centers: [V, 2], principal points, pixels.
+        half_widths: [V], pixels.
+    """
+
+    rotations: np.ndarray
+    translations: np.ndarray
+    focal: np.ndarray
+    centers: np.ndarray
+    half_widths: np.ndarray
+
+    @classmethod
+    def of(cls, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> Pinholes:
+        """Cameras of viewmats [V, 4, 4], intrinsics [V, 3, 3] in pixels, and sizes [V, 2] (width, height)."""
+        return cls(viewmats[:, :3, :3], viewmats[:, :3, 3], Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2], 0.5 * sizes[:, 0])
+
+    def where(self, kept: np.ndarray, others: Pinholes) -> Pinholes:
+        """These where `kept` [V] bool, elsewhere the others."""
+        pairs = ((getattr(self, field.name), getattr(others, field.name)) for field in fields(Pinholes))
+        return Pinholes(*(np.where(kept.reshape(-1, *[1] * (own.ndim - 1)), own, other) for own, other in pairs))
+
+    def moved(self, by: np.ndarray, depths: np.ndarray) -> Pinholes:
+        """The cameras after a step.
+
+        Args:
+            by: [V, PARAMETERS]: rotation vector (3), in radians; translation (3), in `depths`; focal lengths (2),
+                relative; principal point (2), in half widths.
+            depths: [V], of what is before each camera.
+        """
+        turns = _rotations(by[:, :3])
+        translations = np.einsum("vij,vj->vi", turns, self.translations) + by[:, 3:6] * depths[:, None]
+        return replace(
+            self,
+            rotations=turns @ self.rotations,
+            translations=translations,
+            focal=self.focal * (1.0 + by[:, 6:8]),
+            centers=self.centers + by[:, 8:] * self.half_widths[:, None],
+        )
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Cameras and points that agree better with one another.
+
+    Args:
+        cameras, points: of the same photos, and [M, 3].
+        spread: [PARAMETERS, PARAMETERS] covariance of how cameras differ from those that were given, in the units of
+            `Pinholes.moved`.
+        count: how many cameras are others than those that were given.
+        before, after: medians of `reprojection_errors`, in pixels.
+    """
+
+    cameras: Pinholes
+    points: np.ndarray
+    spread: np.ndarray
+    count: int
+    before: float
+    after: float
+
+    def text(self, called: str) -> str:
+        """What was done, in a line. `called`: what the cameras are."""
+        return (
+            f"{self.count} of {len(self.cameras.focal)} {called} refined, each with a lens of its own: points are "
+            f"{self.after:.2f} pixels from where photos show them, {self.before:.2f} before (medians)"
+        )
+
+
+def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observations) -> Refinement:
+    """Cameras and points that agree better with one another.
+
+    Args:
+        cameras: as they were given.
+        points: [M, 3] float64.
+        observations: of these points by these cameras.
+    """
+    adjustment = _Adjustment(cameras, points, observations)
+    for _ in range(ROUNDS):
+        for _ in range(CAMERA_STEPS):
+            adjustment.move_cameras()
+            adjustment.learn_spread()
+        for _ in range(POINT_STEPS):
+            adjustment.move_points()
+    refined, moved = adjustment.agreeing_cameras(), adjustment.points
+    count = int((refined.focal != cameras.focal).any(axis=1).sum())
+    medians = (_median(adjustment.first_errors), _median(reprojection_errors(refined, moved, observations)))
+    return Refinement(refined, moved, adjustment.spread, count, *medians)
+
+
+def refine_alone(
+    cameras: Pinholes, points: np.ndarray, observations: Observations, spread: np.ndarray | None = None
+) -> Pinholes:
+    """Cameras that agree better with points, which stay.
+
+    Args:
+        cameras, points, observations: as in `refine_together`.
+        spread: of a `Refinement` of other photos of the capture; None: `PRIOR` of each parameter.
+    """
+    adjustment = _Adjustment(cameras, points, observations, spread)
+    for _ in range(RESECTION_STEPS):
+        adjustment.move_cameras()
+    return adjustment.agreeing_cameras()
+
+
+def _median(errors: np.ndarray) -> float:
+    """0 where there are none."""
+    return float(np.median(errors)) if len(errors) else 0.0
+
+
+def reprojection_errors(cameras: Pinholes, points: np.ndarray, observations: Observations) -> np.ndarray:
+    """[O] pixels between where cameras see points and where photos show them; infinite behind a camera."""
+    return _Adjustment(cameras, points, observations).first_errors
+
+
+def farthest_match(cameras: Pinholes) -> float:
+    """`FARTHEST_MATCH` in pixels."""
+    return FARTHEST_MATCH * 2.0 * float(np.median(cameras.half_widths))
+
+
+def of_these_photos(cameras: Pinholes, points: np.ndarray, observations: Observations) -> bool:
+    """Whether observations are of the photos of these cameras, and not of others or in another size: half of the points
+    are within `farthest_match`."""
+    return _median(reprojection_errors(cameras, points, observations)) <= farthest_match(cameras)
+
+
+class _Adjustment:
+    """Cameras and points on their way. What observations have is coordinate by coordinate, [2, O] or [3, O]: a row is
+    read and written in one go.
+
+    Attributes:
+        places: [3, M], the points.
+        pixels: [2, O], where photos show them.
+        moves: [V, PARAMETERS], how far each camera has come.
+        spread: [PARAMETERS, PARAMETERS], the prior's covariance of these.
+        doubts: [V, PARAMETERS, PARAMETERS], the covariance of each camera's moves that is left by what the photo shows
+            and the prior; zero where the photo shows too little to be refined.
+        entries: [9, O], room for what each observation adds to its point's normal equations.
+        depths: [V], medians of the points before each camera.
+        first_errors: [O] pixels, before the first step.
+        scale: pixels, the median of these: errors far above it count little.
+    """
+
+    def __init__(
+        self, cameras: Pinholes, points: np.ndarray, observations: Observations, spread: np.ndarray | None = None
+    ) -> None:
+        self.given = self.cameras = cameras
+        views = len(cameras.focal)
+        self.places, self.pixels = (np.array(rows.T, order="C") for rows in (points, observations.pixels))
+        self.point_ids = observations.point_ids
+        self.starts = np.searchsorted(observations.view_ids, np.arange(views + 1))
+        self.moves = np.zeros((views, PARAMETERS))
+        self.spread = PRIOR**2 * np.eye(PARAMETERS) if spread is None else spread
+        self.doubts = np.zeros((views, PARAMETERS, PARAMETERS))
+        self.entries = np.empty((9, len(self.point_ids)))
+        bounds = [0]  # of views together, so that a step has few large operations
+        for view in range(views):
+            if self.starts[view + 1] - self.starts[bounds[-1]] > CHUNK and view > bounds[-1]:
+                bounds.append(view)
+        self.chunks = list(zip(bounds, [*bounds[1:], views], strict=True))
+        seen = [self._seen(*chunk) for chunk in self.chunks]
+        depths = self._by_view(np.concatenate([sights[2] for sights, _, _ in seen]))
+        self.depths = np.array([np.median(part) if len(part) else 1.0 for part in depths])
+        self.first_errors = np.concatenate([errors for _, _, errors in seen])
+        self.scale = max(_median(self.first_errors), FINEST)
+
+    @property
+    def points(self) -> np.ndarray:
+        """[M, 3]."""
+        return np.ascontiguousarray(self.places.T)
+
+    def _by_view(self, values: np.ndarray) -> list[np.ndarray]:
+        return np.split(values, self.starts[1:-1])
+
+    def _parts(self, first: int, last: int) -> Iterator[tuple[int, slice]]:
+        """Each of the views `first` to `last`, and the place of its observations among theirs."""
+        bounds = itertools.pairwise((self.starts[first : last + 1] - self.starts[first]).tolist())
+        return ((view, slice(*own)) for view, own in enumerate(bounds, first))
+
+    def _seen(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The observations of views: x / z, y / z and z in the camera [3, n]; residuals [2, n]; their lengths [n],
+        infinite behind the camera."""
+        part, cameras = slice(self.starts[first], self.starts[last]), self.cameras
+        sights = np.take(self.places, self.point_ids[part], axis=1)
+        residuals = np.empty((2, sights.shape[1]))
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
+            for view, own in self._parts(first, last):
+                sights[:, own] = cameras.rotations[view] @ sights[:, own] + cameras.translations[view][:, None]
+                sights[:2, own] /= sights[2, own]
+                residuals[:, own] = sights[:2, own] * cameras.focal[view][:, None] + cameras.centers[view][:, None]
+            np.subtract(self.pixels[:, part], residuals, out=residuals)
+            errors = np.sqrt((residuals * residuals).sum(axis=0))
+        return sights, residuals, np.where((sights[2] > 0) & np.isfinite(errors), errors, math.inf)
+
+    def _counted(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The observations of views: x / z, y / z and 1 / z in the camera [3, n]; residuals [2, n]; Cauchy's weights
+        [n], in units of the noise. All are 0 where the error is infinite."""
+        sights, residuals, errors = self._seen(first, last)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
+            np.divide(1.0, sights[2], out=sights[2])
+            weights = 1.0 / (self.scale**2 + errors * errors)
+        if (left_out := weights == 0).any():
+            sights[:, left_out], residuals[:, left_out] = 0.0, 0.0
+        return sights, residuals, weights
+
+    def move_cameras(self) -> None:
+        """One step of every camera."""
+        sums = [self._camera_sums(*chunk) for chunk in self.chunks]
+        products, slopes = map(np.concatenate, zip(*sums, strict=True))
+        factors, prior = self._camera_factors(), np.linalg.inv(self.spread)  # [V, 2, PARAMETERS, 9]
+        normals = (factors @ products[:, None] @ factors.swapaxes(2, 3)).sum(axis=1) + prior
+        told = np.diff(self.starts) >= FEWEST_OBSERVATIONS
+        self.doubts[told] = np.linalg.inv(normals[told])
+        right = np.einsum("vcai,vic->va", factors, slopes) - self.moves @ prior  # of the normal equations
+        steps = np.einsum("vab,vb->va", self.doubts, right)
+        self.moves += steps
+        self.cameras = self.cameras.moved(steps, self.depths)
+
+    def _camera_factors(self) -> np.ndarray:
+        """[V, 2, PARAMETERS, 9]: how x and y of a pixel change by each parameter of its camera, in factors of functions
+        of the point, listed at `_camera_sums`."""
+        factors = np.zeros((len(self.depths), 2, PARAMETERS, 9))
+        for axis, (derivatives, focal) in enumerate(zip(DERIVATIVES, self.cameras.focal.T, strict=True)):
+            for parameter, function, sign in derivatives:
+                factors[:, axis, parameter, function] = sign * focal * (self.depths if function >= 6 else 1.0)
+            factors[:, axis, 8 + axis, 0] = self.cameras.half_widths
+        return factors
+
+    def _camera_sums(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
+        """[v, 9, 9], [v, 9, 2]: of each view, weighted sums of products of nine functions with each other and with the
+        residuals. The functions are 1, p, q, pp, pq, qq, 1 / z, p / z and q / z, where p is x / z and q is y / z."""
+        (p, q, near), residuals, weights = self._counted(first, last)
+        roots = np.sqrt(weights)
+        functions = np.stack([np.ones_like(p), p, q, p * p, p * q, q * q, near, near * p, near * q])
+        functions *= roots
+        residuals *= roots
+        products, slopes = np.empty((last - first, 9, 9)), np.empty((last - first, 9, 2))
+        for view, own in self._parts(first, last):
+            products[view - first] = functions[:, own] @ functions[:, own].T
+            slopes[view - first] = functions[:, own] @ residuals[:, own].T
+        return products, slopes
+
+    def learn_spread(self) -> None:
+        """One step of expectation-maximisation of the prior."""
+        refined = self.doubts[:, 0, 0] > 0
+        if refined.any():
+            squares = self.moves[refined].T @ self.moves[refined] + self.doubts[refined].sum(axis=0)
+            self.spread = squares / refined.sum() + SMALLEST_VARIANCE * np.eye(PARAMETERS)
+
+    def move_points(self) -> None:
+        """One step of every point that two photos show."""
+        factors, count, entries = self._point_factors(), self.places.shape[1], self.entries
+        for first, last in self.chunks:
+            entries[:, self.starts[first] : self.starts[last]] = self._point_entries(first, last, factors)
+        seen = np.bincount(self.point_ids, entries[0] + entries[3] + entries[5] > 0, count)
+        sums = np.stack([np.bincount(self.point_ids, values, count) for values in entries])  # [9, M]
+        traces = sums[0] + sums[3] + sums[5]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
+            sums = sums / traces
+            sums[[0, 3, 5]] += POINT_DAMPING
+            self.places += np.where((seen >= 2) & (traces > 0), _solved(*sums), 0.0)
+
+    def _point_factors(self) -> np.ndarray:
+        """[V, 9, 9]: six of a symmetric matrix and three of a vector, of a point's normal equations in the world, in
+        factors of functions of what a photo shows of it, listed at `_point_entries`."""
+        across, down, ahead = self.cameras.rotations.swapaxes(0, 1)  # [V, 3] each
+        (fx, fy), (i, j) = self.cameras.focal.T[:, :, None], UPPER
+        factors = np.zeros((len(fx), 9, 9))
+        factors[:, :6, 0] = fx**2 * across[:, i] * across[:, j] + fy**2 * down[:, i] * down[:, j]
+        for column, axis, focal in ((1, across, fx), (2, down, fy)):
+            factors[:, :6, column] = -(focal**2) * (axis[:, i] * ahead[:, j] + ahead[:, i] * axis[:, j])
+            factors[:, :6, column + 2] = focal**2 * ahead[:, i] * ahead[:, j]
+            factors[:, 6:, column + 4] = focal * axis
+            factors[:, 6:, column + 6] = -focal * ahead
+        return factors
+
+    def _point_entries(self, first: int, last: int, factors: np.ndarray) -> np.ndarray:
+        """[9, n]: what each observation adds to its point's normal equations; `factors` are `_point_factors`."""
+        (p, q, near), (across, down), weights = self._counted(first, last)
+        weights *= near
+        across, down = across * weights, down * weights
+        weights *= near
+        functions = np.stack([weights, weights * p, weights * q, weights * p * p, weights * q * q, across, down,
+                              across * p, down * q])  # fmt: skip
+        for view, own in self._parts(first, last):
+            functions[:, own] = factors[view] @ functions[:, own]
+        return functions
+
+    def agreeing_cameras(self) -> Pinholes:
+        """The cameras; the given one where its photo agrees no better."""
+        pairs = zip(self._by_view(self.first_errors), self._by_view(self.errors()), strict=True)
+        better = np.array([len(new) > 0 and np.median(new) < np.median(old) for old, new in pairs])
+        return self.cameras.where(better, self.given)
+
+    def errors(self) -> np.ndarray:
+        """[O] pixels between where points are seen and where photos show them; infinite behind a camera."""
+        return np.concatenate([self._seen(*chunk)[2] for chunk in self.chunks])
+
+
+def _solved(a, b, c, d, e, f, x, y, z) -> np.ndarray:
+    """[3, M]: the solutions of M systems ((a, b, c), (b, d, e), (c, e, f)) s = (x, y, z), by Cramer's rule."""
+    aa, ab, ac, bb, bc, cc = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * aa + b * ab + c * ac
+    return np.stack([aa * x + ab * y + ac * z, ab * x + bb * y + bc * z, ac * x + bc * y + cc * z]) / determinant
+
+
+def _rotations(vectors: np.ndarray) -> np.ndarray:
+    """[V, 3, 3] of rotation vectors [V, 3] (Rodrigues)."""
+    angles = np.linalg.norm(vectors, axis=1)[:, None, None]
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    return np.eye(3) + np.sinc(angles / np.pi) * cross + 0.5 * np.sinc(angles / (2 * np.pi)) ** 2 * (cross @ cross)

@@ -1,0 +1,141 @@
+"""What a reader of one file format hands to `load_scene`: a capture in its own coordinates, checked, photos unread."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
+from typing import Literal
+
+import numpy as np
+
+from turbogs_plugin.captures.undistort import Lens
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.scene import Observations
+
+FEWEST_PHOTOS = 3
+"""Fewest photos of a capture."""
+
+LARGEST_SIDE = 65535
+"""Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
+
+AGAIN = "export or reconstruct it again"
+
+
+@dataclass
+class Capture:
+    """V posed photos and M points, in the capture's own coordinates.
+
+    Args:
+        names: V distinct names, ascending.
+        photo_folder: photos of full size are ``photo_folder / name``; copies reduced by a factor may lie beside it, in
+            a folder of the same name with ``_2``, ``_4``, ... appended.
+        viewmats: [V, 4, 4] float64, world to camera (x right, y down, z forward).
+        Ks: [V, 3, 3] float64, intrinsics of the full-size photos, undistorted where they have a lens.
+        sizes: [V, 2] int64 (width, height) of the full-size photos, undistorted where they have a lens.
+        points: [M, 3] float64.
+        point_colors: [M, 3] uint8; None: the points were drawn at random, and their colours are taken from the photos
+            (`colors_in_photos`).
+        lenses: one a view, None for a pinhole camera; given as empty where all are.
+        notes: what the capture was taken for, and what was done with it: lines for the user.
+        test: [V] bool, the test views of the capture's own split; None: views are split by their order.
+        reduction: the photos are already smaller than the capture's full size by this factor.
+        alpha: what the alpha of a transparent photo is: the object's ``opacity``, so that the background shows through
+            and training makes the model as transparent; or a ``mask``, whose zero pixels are ignored.
+        mask_files: files of masks that the capture names, one a view or None; given as empty where it names none.
+        observations: where photos show the points, in pixels of the full-size photos, undistorted where they have a
+            lens; None: the capture does not say.
+    """
+
+    names: tuple[str, ...]
+    photo_folder: Path
+    viewmats: np.ndarray
+    Ks: np.ndarray
+    sizes: np.ndarray
+    points: np.ndarray
+    point_colors: np.ndarray | None = None
+    lenses: tuple[Lens | None, ...] = ()
+    notes: tuple[str, ...] = ()
+    test: np.ndarray | None = None
+    reduction: int = 1
+    alpha: Literal["opacity", "mask"] = "opacity"
+    mask_files: tuple[Path | None, ...] = ()
+    observations: Observations | None = None
+
+    def __post_init__(self) -> None:
+        self.lenses = self.lenses or (None,) * len(self.names)
+        self.mask_files = self.mask_files or (None,) * len(self.names)
+
+    @property
+    def photo_sizes(self) -> np.ndarray:
+        """[V, 2] int64 (width, height) that the full-size photos have on disk, if they are of their cameras' size."""
+        both = zip(self.lenses, self.sizes, strict=True)
+        return np.array([size if lens is None else lens.photo_size for lens, size in both])
+
+    def checked(self, source: Path) -> Capture:
+        """Itself. Raises `InputError` unless every number is finite and in range. `source` is named in messages."""
+        if not self.names:
+            raise InputError(f"{source} has no images with a pose: reconstruct the capture again")
+        bad = ~np.isfinite(self.points).all(axis=1)
+        if bad.any():
+            raise InputError(f"{source}: {bad.sum()} of {len(bad)} 3D points are not finite: {AGAIN}")
+        orthogonality = self.viewmats[:, :3, :3] @ self.viewmats[:, :3, :3].transpose(0, 2, 1) - np.eye(3)
+        with np.errstate(invalid="ignore"):
+            posed = np.isfinite(self.viewmats).all(axis=(1, 2)) & (np.abs(orthogonality).max(axis=(1, 2)) < 1e-3)
+            posed &= np.linalg.det(np.nan_to_num(self.viewmats[:, :3, :3])) > 0
+        focal = self.Ks[:, [0, 1], [0, 1]]
+        lensed = np.isfinite(self.Ks).all(axis=(1, 2)) & (focal > 0).all(axis=1)
+        sized = ((self.sizes >= 1) & (self.sizes <= LARGEST_SIDE)).all(axis=1)
+        for ok, trouble in (
+            (posed, "a pose that is not a finite rotation and translation"),
+            (lensed, "intrinsics that are not finite with positive focal lengths"),
+            (sized, f"a size outside 1 .. {LARGEST_SIDE} pixels"),
+        ):
+            if not ok.all():
+                raise InputError(
+                    f"{source}: image '{self.names[int(np.argmin(ok))]}' has {trouble} ({(~ok).sum()} such images): "
+                    + AGAIN
+                )
+        return self
+
+
+def named(names: Sequence[str], most: int = 3) -> str:
+    """The first of some names."""
+    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
+
+
+def left_out(absent: Sequence[str], count: int, called: str) -> str:
+    """The note where `absent` photos of `count` do not exist; `called` is what the capture has of each."""
+    return f"{len(absent)} of {count} {called} are left out, their photos do not exist: {absent[0]}, ..."
+
+
+def require_enough(scene: Path, source: Path, absent: Sequence[str], count: int, unclear: str = "") -> None:
+    """Raise `InputError` where photos of a file's `count` frames do not exist and fewer than `FEWEST_PHOTOS` remain.
+
+    Args:
+        absent: names of the photos that do not exist.
+        unclear: why they were not found elsewhere.
+    """
+    if absent and count - len(absent) < FEWEST_PHOTOS:
+        raise InputError(
+            f"{source} names {count} photos, of which {len(absent)} are missing in {scene} ({absent[0]}, ...): at "
+            f"least {FEWEST_PHOTOS} are needed; copy the photos there{unclear}"
+        )
+
+
+def check_photo_name(name: str, source: Path) -> str:
+    """The name, with slashes where a Windows machine wrote backslashes, if it can be printed and stays within the photo
+    folder; else `InputError`."""
+    path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
+    if not name.isprintable():
+        raise InputError(f"{source}: image name {name!r} has signs that cannot be printed: rename the photo")
+    if not path.parts or ".." in path.parts or path.drive or path.root:
+        raise InputError(f"{source}: image name {name!r} leaves the photo folder: names must be relative, without '..'")
+    return name.replace("\\", "/")
+
+
+def sizes_text(sizes: np.ndarray) -> str:
+    """Sizes of photos [V, 2] in words: ``800x600``, or the size with fewest and the one with most pixels."""
+    ordered = sizes[np.lexsort((sizes[:, 0], np.prod(sizes, axis=1)))]  # of equally many pixels, the upright one first
+    ends = (f"{width:g}x{height:g}" for width, height in ordered[[0, -1]])
+    return " to ".join(dict.fromkeys(ends))

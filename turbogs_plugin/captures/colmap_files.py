@@ -1,0 +1,277 @@
+"""COLMAP's cameras, images and points3D files, binary or text.
+
+pycolmap makes an object of every feature, of which captures have millions, trusts a count of 2^60 in a damaged file,
+and refuses reconstructions of which a script took a part out. So the records are read here: no count allocates more
+than its file holds. Each image has its own pose in these files, so rigs and frames are not needed.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from turbogs_plugin.errors import InputError
+
+if TYPE_CHECKING:
+    import pycolmap
+
+FILES, SUFFIXES = ("cameras", "images", "points3D"), (".bin", ".txt")
+FEATURE = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
+"""Where an image shows something, and the identifier of the point that it is, or `NO_POINT`."""
+POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error", "<f8")])
+"""A point, without its track."""
+NO_POINT = np.uint64(2**64 - 1)
+TRACK_ELEMENT_BYTES = 8
+SMALLEST_IMAGE, SMALLEST_CAMERA = 73, 24
+"""Bytes of an image with a name of one letter and without features; of a camera without parameters."""
+LONGEST_NAME = 4096
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """A photo of a reconstruction.
+
+    Args:
+        number: COLMAP's identifier.
+        camera: identifier of its camera.
+        name: as the file has it, below the folder of the photos.
+        quat: [4] float64 wxyz, world to camera, of any length.
+        translation: [3] float64.
+        features: [n] of `FEATURE`.
+    """
+
+    number: int
+    camera: int
+    name: str
+    quat: np.ndarray
+    translation: np.ndarray
+    features: np.ndarray
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """A reconstruction: cameras by their identifiers, images in the file's order, points [M] of `POINT` by theirs."""
+
+    cameras: dict[int, pycolmap.Camera]
+    images: list[ModelImage]
+    points: np.ndarray
+
+
+def read_model(folder: Path, suffix: str) -> ColmapModel:
+    """The reconstruction in a folder.
+
+    Args:
+        suffix: '.bin' or '.txt'.
+
+    Raises:
+        InputError: a file is damaged, or an image has a camera that is not there; the line names file and place.
+    """
+    cameras, images, points = (folder / f"{file}{suffix}" for file in FILES)
+    if suffix == ".bin":
+        model = ColmapModel(_binary_cameras(cameras), list(_binary_images(images)), _binary_points(points))
+    else:
+        model = ColmapModel(_text_cameras(cameras), list(_text_images(images)), _text_points(points))
+    for image in model.images:
+        if image.camera not in model.cameras:
+            raise _damaged(
+                images, f"image {image.number} has camera {image.camera}, which {cameras.name} does not have"
+            )
+        pose = np.concatenate([image.quat, image.translation])
+        if not np.isfinite(pose).all() or not 1e-6 < np.abs(image.quat).max() < 1e6:
+            raise _damaged(images, f"image {image.number} has a pose that is not finite, or a zero rotation")
+    return ColmapModel(model.cameras, model.images, model.points[np.argsort(model.points["id"], kind="stable")])
+
+
+def count_images(path: Path) -> int:
+    """Images that a file of images announces; damage is left to `read_model`."""
+    try:
+        if path.suffix == ".txt":
+            return sum(1 for _ in _pairs_of_lines(path))
+        with path.open("rb") as file:
+            announced = int.from_bytes(file.read(8), "little")
+        return min(announced, path.stat().st_size // SMALLEST_IMAGE)
+    except OSError:
+        return 0
+
+
+def _damaged(path: Path, trouble: str) -> InputError:
+    return InputError(f"{path} is damaged: {trouble}; copy or reconstruct it again")
+
+
+def _camera(path: Path, number: int, model: str, width: int, height: int, params: list[float]) -> pycolmap.Camera:
+    import pycolmap
+
+    if not (0 < width < 2**31 and 0 < height < 2**31):
+        raise _damaged(path, f"camera {number} is {width}x{height} pixels")
+    try:
+        camera = pycolmap.Camera(camera_id=number, model=model, width=width, height=height, params=params)
+    except Exception as error:  # pycolmap raises whatever C++ threw
+        raise _damaged(path, f"camera {number} has the unknown model {model}") from error
+    if not camera.verify_params():
+        raise _damaged(path, f"camera {number} is {model} with {len(params)} parameters")
+    return camera
+
+
+class _Binary:
+    """A file's bytes, read from front to end; asking for more than there are raises `InputError`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self.data = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"cannot read {path}: {error.strerror}") from error
+        self.position = 0
+
+    def skip(self, size: int) -> int:
+        """Step over `size` bytes and return where they began."""
+        start = self.position
+        if size > len(self.data) - start:
+            raise _damaged(self.path, f"{size} bytes are wanted at byte {start}, the file has {len(self.data)} in all")
+        self.position += size
+        return start
+
+    def unpack(self, format: str) -> tuple:
+        layout = struct.Struct("<" + format)
+        return layout.unpack_from(self.data, self.skip(layout.size))
+
+    def count(self, smallest: int) -> int:
+        """A uint64 count of records that take at least `smallest` bytes each."""
+        (count,) = self.unpack("Q")
+        if count > (len(self.data) - self.position) // smallest:
+            raise _damaged(self.path, f"it announces {count} records, more than its {len(self.data)} bytes can hold")
+        return count
+
+    def records(self, smallest: int) -> Iterator[int]:
+        """The numbers of the records that the file announces. Nothing may follow them."""
+        yield from range(self.count(smallest))
+        if self.position != len(self.data):
+            raise _damaged(self.path, f"{len(self.data) - self.position} bytes follow its last record")
+
+    def name(self) -> str:
+        start = self.position
+        end = self.data.find(b"\0", start, start + LONGEST_NAME)
+        if end < 0:
+            raise _damaged(self.path, f"the image name at byte {start} has no end")
+        self.position = end + 1
+        return self.data[start:end].decode(errors="surrogateescape")
+
+
+def _binary_cameras(path: Path) -> dict[int, pycolmap.Camera]:
+    import pycolmap
+
+    models = {int(model): name for name, model in pycolmap.CameraModelId.__members__.items() if int(model) >= 0}
+    file, cameras = _Binary(path), {}
+    for _ in file.records(SMALLEST_CAMERA):
+        number, model, width, height = file.unpack("IiQQ")
+        if model not in models:
+            raise _damaged(path, f"camera {number} has the unknown model {model}")
+        known = pycolmap.Camera.create_from_model_name(1, models[model], 1.0, 1, 1)
+        params = list(file.unpack(f"{len(known.params)}d"))
+        cameras[number] = _camera(path, number, models[model], width, height, params)
+    return cameras
+
+
+def _binary_images(path: Path) -> Iterator[ModelImage]:
+    file = _Binary(path)
+    for _ in file.records(SMALLEST_IMAGE):
+        number, *pose, camera = file.unpack("I7dI")
+        name = file.name()
+        count = file.count(FEATURE.itemsize)
+        features = np.frombuffer(file.data, FEATURE, count, file.skip(count * FEATURE.itemsize))
+        yield ModelImage(number, camera, name, np.array(pose[:4]), np.array(pose[4:]), features)
+
+
+def _binary_points(path: Path) -> np.ndarray:
+    """[M] of `POINT`, by one number of each record and in one go: captures have millions of them."""
+    file = _Binary(path)
+    smallest, length, starts = POINT.itemsize + 8, struct.Struct("<Q").unpack_from, []
+    for _ in file.records(smallest):
+        starts.append(file.skip(smallest))
+        file.skip(TRACK_ELEMENT_BYTES * length(file.data, file.position - 8)[0])
+    if not starts:
+        return np.zeros(0, POINT)
+    records = np.lib.stride_tricks.sliding_window_view(np.frombuffer(file.data, "u1"), POINT.itemsize)
+    return records[starts].view(POINT)[:, 0]
+
+
+def _lines(path: Path) -> list[str]:
+    """A text file's lines; a name need not be UTF-8, but then cannot be printed."""
+    try:
+        return path.read_text(encoding="utf-8-sig", errors="surrogateescape").split("\n")
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+
+
+def _pairs_of_lines(path: Path) -> Iterator[tuple[int, str, str]]:
+    """The number of the line of each image in an ``images.txt``, that line, and its line of features, which may be
+    empty."""
+    lines = enumerate(_lines(path), start=1)
+    for number, line in lines:
+        if line.strip() and not line.startswith("#"):
+            yield number, line, next(lines, (0, ""))[1]
+
+
+def _text_records(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """The number and the words of each line that is neither empty nor a comment."""
+    for number, line in enumerate(_lines(path), start=1):
+        if (words := line.split()) and not words[0].startswith("#"):
+            yield number, words
+
+
+def _line_damaged(path: Path, number: int, what: str) -> InputError:
+    return _damaged(path, f"line {number} is not {what}")
+
+
+def _text_cameras(path: Path) -> dict[int, pycolmap.Camera]:
+    cameras = {}
+    for line, words in _text_records(path):
+        try:
+            number, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+            params = [float(word) for word in words[4:]]
+        except (ValueError, IndexError):
+            raise _line_damaged(path, line, "a camera: identifier, model, width, height and parameters") from None
+        cameras[number] = _camera(path, number, model, width, height, params)
+    return cameras
+
+
+def _text_images(path: Path) -> Iterator[ModelImage]:
+    for line, text, features in _pairs_of_lines(path):
+        words = text.lstrip().split(" ", 9)  # the name is the rest, with its spaces
+        try:
+            number, pose, camera, name = int(words[0]), np.array(words[1:8], np.float64), int(words[8]), words[9]
+        except (ValueError, IndexError):
+            what = "an image: identifier, rotation (4 numbers), translation (3), camera and name"
+            raise _line_damaged(path, line, what) from None
+        yield ModelImage(number, camera, name, pose[:4], pose[4:], _text_features(path, line + 1, features))
+
+
+def _text_features(path: Path, line: int, text: str) -> np.ndarray:
+    words = text.split()
+    features = np.zeros(len(words) // 3, FEATURE)
+    try:
+        numbers = np.array(words, np.float64).reshape(-1, 3)
+        points = [int(word) for word in words[2::3]]
+        features["point"] = np.array([NO_POINT if point < 0 else point for point in points], np.uint64)
+    except (ValueError, OverflowError):
+        raise _line_damaged(path, line, "the features of an image: x, y and point, again and again") from None
+    features["pixel"] = numbers[:, :2]
+    return features
+
+
+def _text_points(path: Path) -> np.ndarray:
+    points = []
+    for line, words in _text_records(path):
+        try:
+            xyz, color = tuple(map(float, words[1:4])), tuple(map(int, words[4:7]))
+            points.append((int(words[0]), xyz, color, float(words[7])))
+            np.array(points[-1:], POINT)
+        except (ValueError, IndexError, OverflowError):
+            what = "a point: identifier, x, y, z, red, green, blue (0 .. 255), error and track"
+            raise _line_damaged(path, line, what) from None
+    return np.array(points, POINT)

@@ -1,0 +1,224 @@
+"""Photo files: their sizes, and their pixels as training wants them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import ExifTags, Image, UnidentifiedImageError
+from torch import Tensor
+
+from turbogs_plugin.captures.undistort import Lens
+from turbogs_plugin.device import processor_cores
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.host_arrays import free_host_bytes, host_array
+from turbogs_plugin.scene.photos import Photos, pixel_offsets
+
+MODES = {3: "RGB", 4: "RGBa"}
+"""Pillow's modes, by channels; the latter's colours are multiplied by alpha."""
+AS_STORED = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+"""What turns an upright picture to how a file of this EXIF orientation has it; others have it upright."""
+SMALLEST_SIDE = 4
+"""The shorter side of a reduced photo has at least this many pixels; of fewer, nothing is left to see."""
+OPAQUE_SUFFIXES = (".jpg", ".jpeg")
+"""Suffixes of formats without alpha, whose headers need not be read again."""
+DECODING_BYTES = 24
+"""Bytes of a pixel while its photo is decoded, undistorted and reduced: several copies, one of them in float32."""
+MEMORY_SHARE = 0.25
+"""Photos that are being decoded may take this share of the free memory, with one thread more if need be."""
+MOST_THREADS = 16
+"""Photos are decoded by a thread a processor, but by no more than this."""
+SMALL_WORK = 2**30
+"""Bytes that are not worth a question."""
+
+
+def reduced_sizes(sizes: np.ndarray, factor: int) -> np.ndarray:
+    """[V, 2] int64: sizes divided by `factor`, to the nearest pixel.
+
+    Raises:
+        InputError: the factor leaves a side of less than `SMALLEST_SIDE`.
+    """
+    reduced = np.floor(sizes / factor + 0.5).astype(np.int64)
+    if factor > 1 and reduced.min() < SMALLEST_SIDE:
+        width, height = sizes[sizes.min(axis=1).argmin()].tolist()
+        largest = max(1, int(min(width, height) / (SMALLEST_SIDE - 0.5)))
+        raise InputError(
+            f"--factor {factor} leaves too little of photos of {width}x{height}: the largest that keeps "
+            f"{SMALLEST_SIDE} pixels a side is {largest}"
+        )
+    return reduced
+
+
+def photo_size(path: Path) -> tuple[int, int]:
+    """(width, height) from the file's header alone; `InputError` where it cannot be read, or has more than 8 bits."""
+    with opened_image(path) as image:
+        require_8_bits(image, path)
+        return image.size
+
+
+def require_8_bits(image: Image.Image, path: Path) -> None:
+    if image.mode.startswith(("I", "F")):
+        raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
+
+
+def is_transparent(image: Image.Image) -> bool:
+    """Whether an image may have pixels that are not opaque, by its header."""
+    return "A" in image.getbands() or "transparency" in image.info
+
+
+def is_turned(path: Path) -> bool:
+    """Whether the EXIF orientation of a photo says that width and height are to be exchanged."""
+    with opened_image(path) as image:
+        return image.getexif().get(ExifTags.Base.Orientation) in (5, 6, 7, 8)
+
+
+def channels_of(paths: Sequence[Path]) -> int:
+    """4 where a photo may be transparent, by the headers, else 3."""
+
+    def transparent(path: Path) -> bool:
+        with opened_image(path) as image:
+            return is_transparent(image)
+
+    candidates = [path for path in paths if path.suffix.lower() not in OPAQUE_SUFFIXES]
+    with decoding_threads() as pool:
+        return 4 if any(pool.map(transparent, candidates)) else 3
+
+
+def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
+    """[V, 2] int64 (width, height), from the headers; `InputError` names the first file that cannot be read."""
+    with decoding_threads() as pool:
+        return np.array(list(pool.map(photo_size, paths)), dtype=np.int64).reshape(-1, 2)
+
+
+def photo_array(sizes: np.ndarray, channels: int = 3) -> Tensor:
+    """[X, channels] uint8 for photos of these `sizes` [V, 2], with any content, where there is room (`host_array`).
+
+    Raises:
+        InputError: more photos than fit in memory or on the disk.
+    """
+    return host_array((int(pixel_offsets(sizes)[-1]), channels), torch.uint8, f"{len(sizes)} photos")
+
+
+def load_photos(
+    paths: Sequence[Path],
+    sizes: np.ndarray,
+    targets: np.ndarray,
+    lenses: Sequence[Lens | None],
+    colors: Tensor,
+    loaded: Callable[[], object],
+    meanwhile: Callable[[], object] | None = None,
+) -> Photos:
+    """Decode photos in parallel, undistorted, then reduced to their target sizes by area averaging.
+
+    Photos are taken as stored: an orientation in EXIF is ignored, as COLMAP does.
+
+    Args:
+        paths: V files.
+        sizes: [V, 2] int64 (width, height) that the files must have.
+        targets: [V, 2] int64 (width, height) to give them.
+        lenses: one a photo, None for a pinhole camera.
+        colors: where to put them, as `photo_array` gives it. With 3 channels, photos that are transparent lose their
+            alpha and keep their colours as stored.
+        loaded: called after each photo, by several threads.
+        meanwhile: called once, while photos are decoded.
+
+    Raises:
+        InputError: a photo that cannot be decoded, or is of another size (the first one in order is named); no room
+            for a copy of photos that are all opaque.
+    """
+    offsets = pixel_offsets(targets)
+    channels = colors.shape[1]
+    pixels = colors.numpy()
+
+    def load(view: int) -> bool:
+        """Whether the photo is opaque."""
+        target = tuple(targets[view].tolist())
+        photo = _decode(paths[view], tuple(sizes[view].tolist()), MODES[channels])
+        lens = lenses[view]
+        if lens is not None:
+            size = lens.size_of(photo.size)
+            photo = Image.frombytes(photo.mode, size, lens.undistort(np.asarray(photo), size).tobytes())
+        if photo.size != target:
+            photo = photo.resize(target, Image.Resampling.BOX)
+        pixels[offsets[view] : offsets[view + 1]] = (values := np.asarray(photo)).reshape(-1, channels)
+        loaded()
+        return channels == 3 or bool((values[..., 3] == 255).all())
+
+    largest = int(sizes.prod(axis=1).max(initial=1))
+    opaque = channels == 4
+    with decoding_threads(DECODING_BYTES * largest) as pool:
+        decoded = [pool.submit(load, view) for view in range(len(paths))]
+        try:
+            if meanwhile is not None:
+                meanwhile()
+            opaque &= all([photo.result() for photo in decoded])  # the first error in order is raised
+        finally:
+            pool.shutdown(cancel_futures=True)
+    if opaque:  # after all
+        colors = photo_array(targets).copy_(colors[:, :3])
+    return Photos(colors, targets)
+
+
+def decoding_threads(bytes_each: int = 0) -> ThreadPoolExecutor:
+    """Threads to decode photos: one a processor of this process, but no more than `MEMORY_SHARE` of free memory allows.
+
+    Args:
+        bytes_each: memory that one thread takes.
+    """
+    wanted = min(MOST_THREADS, processor_cores())
+    affordable = int(MEMORY_SHARE * free_host_bytes()) // bytes_each if wanted * bytes_each > SMALL_WORK else wanted
+    return ThreadPoolExecutor(max(1, min(wanted, affordable)))
+
+
+def _decode(path: Path, size: tuple[int, int], mode: str) -> Image.Image:
+    """An image of exactly this size and mode, or `InputError`. The size is checked before any pixel is decoded."""
+    with opened_image(path) as image:
+        if image.size != size:
+            raise InputError(
+                f"photo {path} is {image.size[0]}x{image.size[1]} but its camera is {size[0]}x{size[1]}: "
+                "use the photos that the cameras were reconstructed from"
+            )
+        if mode == "RGBa" or is_transparent(image):
+            image = image.convert("RGBA")
+        return image.convert(mode)
+
+
+@contextmanager
+def opened_image(path: Path, what: str = "photo", remedy: str = "copy it there again") -> Iterator[Image.Image]:
+    """The file with its header read, as stored; `InputError` for whatever goes wrong with it while entered."""
+    try:
+        with Image.open(path) as image:
+            yield _as_stored(image)
+    except InputError:
+        raise
+    except Exception as error:  # a broken file can raise anything in its decoder
+        reason = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
+        if isinstance(error, UnidentifiedImageError):
+            reason = "it is no image of a known kind" if path.stat().st_size else "the file is empty"
+        raise InputError(f"cannot read the {what} {path}: {reason}; {remedy}") from error
+
+
+def _as_stored(image: Image.Image) -> Image.Image:
+    """The image as COLMAP reads it: Pillow turns TIFFs, and them alone, as their orientation says."""
+    if image.format != "TIFF":
+        return image
+    exif = image.getexif()
+    orientation = exif.get(ExifTags.Base.Orientation)
+    if orientation not in AS_STORED:
+        return image
+    stored = image.transpose(AS_STORED[orientation])  # decodes it, and so takes the orientation out of its EXIF data
+    exif[ExifTags.Base.Orientation] = orientation
+    stored.format, stored._exif = image.format, exif  # which a transposed image has not
+    return stored

@@ -1,0 +1,330 @@
+"""Loading: a folder becomes a scene that can be trained on."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, named
+from turbogs_plugin.captures.decoding import (
+    channels_of,
+    is_turned,
+    load_photos,
+    photo_array,
+    photo_sizes,
+    reduced_sizes,
+)
+from turbogs_plugin.captures.kinds import capture_around, read_capture
+from turbogs_plugin.captures.mask_files import find_masks, load_masks
+from turbogs_plugin.captures.starting_points import colors_in_photos
+from turbogs_plugin.captures.undistort import undistortion_note
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.masks import PixelMasks, ViewMask
+from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.scene.geometry import camera_centers
+from turbogs_plugin.scene.host_arrays import file_note
+from turbogs_plugin.scene.scene import PosedImages, PosedViews, Scene
+from turbogs_plugin.types import Cameras
+
+MOST_PIXELS = 1 << 28
+"""Pixels of a photo as it is trained on. Where tiles are drawn whole, a draw tells 2^20 of a view apart (`RANK_BITS` of
+engine/reference/draws.py)."""
+FARTHEST = 1e15
+"""Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
+
+
+@dataclass(frozen=True)
+class PhotoFiles:
+    """The files that V photos are read from.
+
+    Args:
+        paths: V files.
+        file_sizes: [V, 2] int64 (width, height) that they have.
+        sizes: [V, 2] int64 (width, height) to give them, undistorted and reduced.
+        note: on photos of another size than their cameras; empty where there is none.
+    """
+
+    paths: list[Path]
+    file_sizes: np.ndarray
+    sizes: np.ndarray
+    note: str = ""
+
+
+def load_scene(
+    path: str | Path,
+    factor: int = 1,
+    test_every: int = 8,
+    progress: Callable[[int, int], object] | None = None,
+    sized: Callable[[np.ndarray, np.ndarray], object] | None = None,
+    meanwhile: Callable[[PosedViews, PosedViews, Tensor], object] | None = None,
+) -> Scene:
+    """Load a capture with its photos.
+
+    Cameras with distortion become pinhole cameras in the same place, their photos are undistorted. Masks are read from
+    where `find_masks` looks, and from the photos' alpha where that is no opacity (`Capture.alpha`); views that are
+    masked whole are left out.
+
+    Args:
+        path: the scene's folder. Where it could be of several kinds, the first of these is taken: a COLMAP
+            reconstruction (binary or text, in ``sparse``, ``colmap/sparse``, ... or numbered folders of these), a
+            ``transforms.json``, NeRF-synthetic's ``transforms_train.json``, LLFF's ``poses_bounds.npy``.
+        factor: photos and intrinsics are reduced by this. Copies in ``images_<factor>`` are used where all are there
+            in the right size; otherwise ``images`` are reduced by area averaging.
+        test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
+            Captures with a split of their own (NeRF-synthetic, lists in a ``transforms.json``) keep it.
+        progress: called with the number of photos decoded so far, and of all, by one thread at a time.
+        sized: called with the sizes [V, 2] (width, height) of training and of test views, before a photo is decoded;
+            what it raises ends the loading.
+        meanwhile: called once, while photos are decoded, with training views, test views and the scene's points.
+
+    Raises:
+        InputError: anything wrong with the scene or the arguments, in one line.
+    """
+    scene = Path(path)
+    for name, number in (("factor", factor), ("test_every", test_every)):
+        if not isinstance(number, int) or number < 1:
+            raise InputError(f"{name} is {number}: it must be an integer of at least 1")
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
+        capture = read_capture(scene, factor)
+    test = _test_views(scene, capture, test_every)
+    frame, viewmats, points = _normalised(scene, capture, test)
+    files = _find_photos(scene, capture, factor)
+    mask_files, mask_note = find_masks(scene, capture, files.paths)
+    masks = load_masks(mask_files, files.paths, capture, files.file_sizes, files.sizes)
+    seen = np.array([mask is None or mask.pixels > 0 for mask in masks])
+    for name, part in (("training", ~test), ("test", test)):
+        if not (part & seen).any():
+            raise InputError(
+                f"{scene}: all {part.sum()} {name} photos are masked whole: zero in a mask, or in "
+                "the alpha of a photo, is masked; mend the masks, or take them away"
+            )
+    parts = [np.flatnonzero(part & seen) for part in (~test, test)]
+    posed = [_posed(capture, viewmats, files.sizes, views) for views in parts]
+    # Before minutes go into photos that have no room.
+    if sized is not None:
+        sized(*(files.sizes[views] for views in parts))
+    colors = [_room(capture, files, views) for views in parts]
+    counter, one_at_a_time = itertools.count(1), Lock()
+
+    def loaded() -> None:
+        with one_at_a_time:
+            if progress is not None:
+                progress(next(counter), int(seen.sum()))
+
+    works = (None if meanwhile is None else partial(meanwhile, posed[0], posed[1], points), None)
+    train, tested = (
+        _load_views(capture, files, views, masks, posed_views, room, loaded, work)
+        for views, posed_views, room, work in zip(parts, posed, colors, works, strict=True)
+    )
+    if capture.point_colors is None:
+        point_colors = colors_in_photos(points, train.cameras, train.photos, train.masks)
+    else:
+        point_colors = torch.from_numpy(capture.point_colors)
+    notes = (
+        files.note,
+        undistortion_note(capture.lenses),
+        mask_note,
+        _masked_note(capture.names, masks, mask_files, files.sizes, seen),
+        "transparent photos are composited on a background (train.background)" if train.photos.transparent else "",
+        file_note([train.photos.stored, tested.photos.stored], "photos"),
+    )
+    return Scene(
+        name=scene.resolve().name,
+        train=train,
+        test=tested,
+        points=points,
+        point_colors=point_colors,
+        frame=frame,
+        extent=1.0,
+        drawn_points=capture.point_colors is None,
+        notes=tuple(filter(None, (*capture.notes, *notes))),
+    )
+
+
+def _test_views(scene: Path, capture: Capture, test_every: int) -> np.ndarray:
+    """[V] bool: the test views, by the capture's own split or by order; enough views remain to train on."""
+    views = len(capture.names)
+    test = np.arange(views) % test_every == 0 if capture.test is None else capture.test
+    if views < FEWEST_PHOTOS:
+        raise InputError(f"{scene} has {views} images: at least {FEWEST_PHOTOS} are needed; add photos to it")
+    if capture.test is not None and (~test).sum() < FEWEST_PHOTOS:
+        raise InputError(f"{scene} has {(~test).sum()} training images: at least {FEWEST_PHOTOS} are needed; add some")
+    if test.all():
+        raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
+    return test
+
+
+def _normalised(scene: Path, capture: Capture, test: np.ndarray) -> tuple[Frame, Tensor, Tensor]:
+    """The normalised frame about the training cameras; in it, float32 poses [V, 4, 4] and points [M, 3]."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
+    viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats)).float()
+    points = torch.from_numpy(frame.normalise_points(capture.points)).float()
+    far = ~(points.abs() < FARTHEST).all(dim=1)
+    if far.any():
+        raise InputError(
+            f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32: take them out"
+        )
+    return frame, viewmats, points
+
+
+def _posed(capture: Capture, viewmats: Tensor, sizes: np.ndarray, views: np.ndarray) -> PosedViews:
+    """Some views' cameras for photos of these `sizes` [V, 2], and what the photos show."""
+    ratios = sizes / capture.sizes  # [V, 2]
+    intrinsics = capture.Ks.copy()
+    intrinsics[:, :2] *= ratios[:, :, None]
+    cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
+    shown = None if capture.observations is None else capture.observations.of_views(views, ratios[views])
+    return PosedViews(cameras, shown)
+
+
+def _room(capture: Capture, files: PhotoFiles, views: np.ndarray) -> Tensor:
+    """Room for the photos of some views, with alpha where that is opacity."""
+    channels = channels_of([files.paths[view] for view in views]) if capture.alpha == "opacity" else 3
+    return photo_array(files.sizes[views], channels)
+
+
+def _load_views(
+    capture: Capture,
+    files: PhotoFiles,
+    views: np.ndarray,
+    masks: list[ViewMask | None],
+    posed: PosedViews,
+    colors: Tensor,
+    loaded: Callable[[], object],
+    meanwhile: Callable[[], object] | None,
+) -> PosedImages:
+    """Some views with their photos, decoded into `colors`; the last two arguments are for `load_photos`."""
+    paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
+    photos = load_photos(paths, files.file_sizes[views], files.sizes[views], lenses, colors, loaded, meanwhile)
+    masked = _pixel_masks([masks[view] for view in views], files.sizes[views])
+    names = tuple(capture.names[view] for view in views)
+    return PosedImages(posed.cameras, names, photos, masked, posed.observations)
+
+
+def _pixel_masks(masks: list[ViewMask | None], sizes: np.ndarray) -> PixelMasks | None:
+    """The masks of views of these `sizes` [V, 2]; None where none has a masked pixel."""
+    if all(mask is None for mask in masks):
+        return None
+    pairs = zip(masks, sizes.tolist(), strict=True)
+    return PixelMasks.of_views([ViewMask.whole(tuple(size)) if mask is None else mask for mask, size in pairs])
+
+
+def _masked_note(
+    names: tuple[str, ...],
+    masks: list[ViewMask | None],
+    files: list[Path | None],
+    sizes: np.ndarray,
+    seen: np.ndarray,
+) -> str:
+    """How much is masked, by the photos' alpha where no file does it, and which views are left out for it, in one line;
+    empty where nothing is masked."""
+    pixels = {view: mask.pixels for view, mask in enumerate(masks) if mask is not None}
+    if not (cut := list(pixels)):
+        return ""
+    share = 1.0 - sum(pixels.values()) / int(sizes[cut].prod(axis=1).sum())
+    gone = [name for name, kept in zip(names, seen, strict=True) if not kept]
+    left_out = f"; {len(gone)} masked whole are left out: {gone[0]}, ..." if gone else ""
+    by_alpha = sum(files[view] is None for view in cut)
+    by = "" if not by_alpha else " by their alpha" if by_alpha == len(cut) else f" ({by_alpha} by their alpha alone)"
+    return f"{len(cut)} photos have masked pixels{by}, {share:.1%} of them{left_out}"
+
+
+def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
+    """The files to read where photos are to be reduced by `factor`: copies in ``images_<factor>`` where all are there
+    in the right size, else the full-size photos."""
+    if factor > 1 and factor % capture.reduction:
+        raise InputError(
+            f"--factor {factor}: the largest photos of {scene} are those of {capture.photo_folder.name}: use --factor "
+            f"{capture.reduction} or a multiple of it, or bring the full-size photos back"
+        )
+    remaining = max(1, factor // capture.reduction)
+    files = _reduced_copies(scene, capture, remaining) or _full_photos(scene, capture, remaining)
+    largest = files.sizes[np.argmax(files.sizes.prod(axis=1))]
+    if largest.prod() > MOST_PIXELS:
+        raise InputError(
+            f"{scene}: a photo would have {largest[0]}x{largest[1]} pixels, more than {MOST_PIXELS}: use --factor "
+            f"{factor * math.ceil(math.sqrt(largest.prod() / MOST_PIXELS))}"
+        )
+    return files
+
+
+def _reduced_copies(scene: Path, capture: Capture, factor: int) -> PhotoFiles | None:
+    if factor == 1:
+        return None
+    reduced_sizes(capture.sizes, factor)  # refuses a factor that is too large
+    folder = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
+    paths = [folder / name for name in capture.names]
+    if capture.photo_folder == scene or not all(path.is_file() for path in paths):
+        return None
+    sizes = photo_sizes(paths)
+    if (np.abs(sizes - capture.photo_sizes / factor) > 1.0).any():
+        return None
+    return PhotoFiles(paths, sizes, _undistorted_sizes(capture, sizes))
+
+
+def _full_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
+    paths = [capture.photo_folder / name for name in capture.names]
+    missing = [name for name, path in zip(capture.names, paths, strict=True) if not path.is_file()]
+    if len(missing) == len(paths) and (where := capture_around(scene)):
+        raise InputError(where)
+    if missing:
+        remedy = _in_other_letters(capture.photo_folder / missing[0]) or "bring them back"
+        raise InputError(
+            f"{len(missing)} of {len(paths)} photos are missing in {capture.photo_folder}: {named(missing)}; {remedy}"
+        )
+    sizes = photo_sizes(paths)
+    note = _require_scaled(paths, sizes, capture.photo_sizes)
+    return PhotoFiles(paths, sizes, reduced_sizes(_undistorted_sizes(capture, sizes), factor), note)
+
+
+def _in_other_letters(path: Path) -> str:
+    """What to do where a file that is missing is there in capital or small letters; empty where it is not."""
+    beside = path.parent.iterdir() if path.parent.is_dir() else ()
+    other = next((file.name for file in beside if file.name.lower() == path.name.lower()), None)
+    return f"{other} is there: give the files the letters that the reconstruction has" if other else ""
+
+
+def _undistorted_sizes(capture: Capture, sizes: np.ndarray) -> np.ndarray:
+    """[V, 2] int64: the sizes that photos of these `sizes` [V, 2] have once they are undistorted."""
+    pairs = zip(capture.lenses, sizes.tolist(), strict=True)
+    return np.array([size if lens is None else lens.size_of(size) for lens, size in pairs], dtype=np.int64)
+
+
+def _require_scaled(paths: list[Path], sizes: np.ndarray, expected: np.ndarray) -> str:
+    """A note on the photos that are not of their cameras' size; empty where all are.
+
+    Raises:
+        InputError: a photo that is no scaled copy, to a pixel, of one of its camera's size: it was cropped or turned.
+    """
+    ratios = sizes / expected  # [V, 2]
+    scaled = (np.abs(expected * ratios[:, ::-1] - sizes) <= 1.0).any(axis=1)
+    if not scaled.all():
+        bad = int(np.argmin(scaled))
+        (width, height), (camera_width, camera_height) = sizes[bad].tolist(), expected[bad].tolist()
+        differ = f"photo {paths[bad]} is {width}x{height} but its camera is {camera_width}x{camera_height}"
+        if is_turned(paths[bad]):
+            raise InputError(
+                f"{differ}: its EXIF orientation turns it, which is not followed here; write its pixels turned, as by  "
+                "magick mogrify -auto-orient PHOTO"
+            )
+        raise InputError(
+            f"{differ}: it was cropped or turned, not scaled; use the photos that the cameras were reconstructed from"
+        )
+    others = np.flatnonzero((sizes != expected).any(axis=1))
+    if not len(others):
+        return ""
+    (width, height), (camera_width, camera_height) = sizes[others[0]].tolist(), expected[others[0]].tolist()
+    return (
+        f"{len(others)} photos in another size than their cameras: intrinsics rescaled from "
+        f"{camera_width}x{camera_height} to {width}x{height}"
+    )

@@ -1,0 +1,158 @@
+"""Masks of a capture: files beside its photos, or the photos' own alpha.
+
+A nonzero pixel of a mask counts, a zero one does not, as COLMAP and nerfstudio have it. A pixel of a photo that is
+undistorted or reduced counts if all pixels that it is made of do.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from PIL import Image
+
+from turbogs_plugin.captures.capture import Capture
+from turbogs_plugin.captures.decoding import (
+    DECODING_BYTES,
+    OPAQUE_SUFFIXES,
+    decoding_threads,
+    is_transparent,
+    opened_image,
+)
+from turbogs_plugin.captures.photo_files import MASKS, find_photos
+from turbogs_plugin.captures.undistort import Lens
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.masks import ViewMask
+
+FOLDER = "masks"
+CONVENTIONS = "NAME.png, NAME.EXTENSION.png or NAME.jpg"
+JPEG_SUFFIXES = (".jpg", ".jpeg", ".JPG", ".JPEG")
+HALF = 128
+"""Value from which a pixel of a JPEG counts, whose compression leaves no exact zeros."""
+
+
+def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[list[Path | None], str]:
+    """The file of each photo's mask, None where there is none, and what to tell the user of it.
+
+    Those that the capture names come first. Others are ``masks/NAME.png`` or COLMAP's ``masks/NAME.EXTENSION.png``,
+    else of the photo's own name or ``masks/NAME.jpg``, in the capture or beside the folder of its photos. For photos
+    of ``images_4``, masks of ``masks_4`` come first.
+
+    Args:
+        photos: the V files.
+    """
+    reduced = re.search(r"_\d+$", photos[0].parents[len(PurePosixPath(capture.names[0]).parts) - 1].name)
+    names = [f"{FOLDER}{reduced[0]}", FOLDER] if reduced else [FOLDER]
+    parents = dict.fromkeys((scene, capture.photo_folder.parent, capture.photo_folder))
+    folders = [parent / name for name in names for parent in parents if (parent / name).is_dir()]
+    found = [file or in_folders(folders, name) for file, name in zip(capture.mask_files, capture.names, strict=True)]
+    count, views = sum(file is not None for file in found), len(found)
+    if count == 0:
+        unused = (f"{folder} is not used: it has no {CONVENTIONS} of a photo" for folder in folders)
+        return found, next(unused, "") or misnamed(parents)
+    first = next(file for file in found if file is not None)
+    without = [name for name, file in zip(capture.names, found, strict=True) if file is None]
+    rest = f"; {len(without)} photos without one are whole: {without[0]}, ..." if without else ""
+    return found, f"masks of {count} of {views} photos, as {first}{rest}"
+
+
+def misnamed(parents: Iterable[Path]) -> str:
+    """A note on the first folder of images in these that is called like one of masks, and not `FOLDER`; empty where
+    there is none."""
+    for parent in parents:
+        try:
+            folders = sorted(entry for entry in parent.iterdir() if re.fullmatch(MASKS, entry.name, re.IGNORECASE))
+        except OSError:  # may be looked into, but not listed
+            continue
+        for folder in folders:
+            place, images = find_photos(folder)
+            if folder.name != FOLDER and images and place == folder:  # not a capture of a mask
+                return f"{folder} is not used: masks are read from {FOLDER}/; rename it if it holds the photos' masks"
+    return ""
+
+
+def in_folders(folders: Sequence[Path], photo: str) -> Path | None:
+    """The mask of a photo in the first of these folders that has one; `photo` is relative to the folder of photos."""
+    stem = PurePosixPath(photo).with_suffix("")
+    names = (f"{stem}.png", f"{photo}.png", photo, *(f"{stem}{suffix}" for suffix in JPEG_SUFFIXES))
+    return next((folder / name for folder in folders for name in names if (folder / name).is_file()), None)
+
+
+def load_masks(
+    files: Sequence[Path | None], photos: Sequence[Path], capture: Capture, sizes: np.ndarray, targets: np.ndarray
+) -> list[ViewMask | None]:
+    """Read masks in parallel, undistorted and reduced as the photos are.
+
+    Args:
+        files: V masks, or None.
+        photos: the V photos; where the capture's alpha is a mask, their alpha counts too.
+        capture: says what lenses and full sizes the photos have.
+        sizes: [V, 2] int64 (width, height) of the photos' files.
+        targets: [V, 2] int64 (width, height) that the photos get.
+
+    Returns:
+        One a view; None where every pixel counts.
+
+    Raises:
+        InputError: a mask that cannot be read, or has neither its photo's nor its camera's size.
+    """
+    full_sizes = capture.photo_sizes
+
+    def load(view: int) -> ViewMask | None:
+        size = tuple(sizes[view].tolist())
+        parts = []
+        if (file := files[view]) is not None:
+            parts.append(_read(file, photos[view], size, tuple(full_sizes[view].tolist())))
+        if capture.alpha == "mask" and photos[view].suffix.lower() not in OPAQUE_SUFFIXES:
+            with opened_image(photos[view]) as image:
+                if is_transparent(image):
+                    parts.append(np.asarray(image.convert("RGBA").getchannel("A")) > 0)
+        if all(part.all() for part in parts):
+            return None
+        keep = np.logical_and.reduce(parts)
+        return ViewMask.of(_placed(keep, capture.lenses[view], tuple(targets[view].tolist())))
+
+    with decoding_threads(DECODING_BYTES * int(full_sizes.prod(axis=1).max(initial=1))) as pool:
+        return list(pool.map(load, range(len(photos))))
+
+
+def _read(file: Path, photo: Path, size: tuple[int, int], full_size: tuple[int, int]) -> np.ndarray:
+    """[height, width] bool: the mask, in the size of the photo."""
+    with opened_image(file, "mask") as image:
+        require_mask_size(file, image.size, photo, size, full_size)
+        if image.mode == "P":
+            image = image.convert("RGBA" if is_transparent(image) else "RGB")
+        least = HALF if image.format == "JPEG" else 1
+        values = np.asarray(image)
+        if values.ndim == 3 and image.mode in ("LA", "RGBA"):
+            values = values[:, :, :-1] * (values[:, :, -1:] > 0)
+        keep = (values.reshape(*values.shape[:2], -1) >= least).any(axis=2)
+    return _reduced(keep, size)
+
+
+def require_mask_size(
+    file: Path, mask_size: tuple[int, int], photo: Path, size: tuple[int, int], other: tuple[int, int]
+) -> None:
+    """Raise `InputError` unless a mask has its photo's `size`, or the `other` one that will do; (width, height)."""
+    if mask_size not in (size, other):
+        raise InputError(
+            f"mask {file} is {mask_size[0]}x{mask_size[1]} but photo {photo} is {size[0]}x{size[1]}: make it of the "
+            "photo's size, nonzero where a pixel counts"
+        )
+
+
+def _placed(keep: np.ndarray, lens: Lens | None, target: tuple[int, int]) -> np.ndarray:
+    """[H, W] bool: the mask after what is done to its photo."""
+    if lens is not None:
+        image = np.where(keep, np.uint8(255), np.uint8(0))[:, :, None]
+        keep = np.asarray(lens.undistort(image, lens.size_of((keep.shape[1], keep.shape[0])))[:, :, 0] == 255)
+    return _reduced(keep, target)
+
+
+def _reduced(keep: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    if keep.shape == (size[1], size[0]):
+        return keep
+    image = Image.fromarray(np.where(keep, np.uint8(255), np.uint8(0)))
+    return np.asarray(image.resize(size, Image.Resampling.BOX)) == 255

@@ -1,0 +1,180 @@
+"""Random points to start from, for captures that bring none, in colours from the photos."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.masks import PixelMasks
+from turbogs_plugin.scene.geometry import camera_centers, evenly, mean_neighbor_distances
+from turbogs_plugin.scene.photos import Photos, pixel_offsets
+from turbogs_plugin.types import Cameras
+
+NUM_RANDOM_POINTS = 50_000
+CELLS, ENOUGH_CELLS = (8, 6), 0.25
+"""Columns and rows of the cells that a view's image is cut into, and the share of them that must have points."""
+PROBES = 10_000
+"""Random points that are projected into all views."""
+PROJECTED_AT_ONCE = 1 << 20
+"""Points times views: it bounds memory."""
+LEAST_SPACING = 1e-2
+"""Cameras nearer to each other than this share of their extent are taken to be in one place."""
+COLOR_VIEWS = 32
+"""Photos that give random points their colours, at most."""
+
+
+def random_points(viewmats: np.ndarray) -> np.ndarray:
+    """[M, 3] float64, the same for the same cameras.
+
+    The cube's centre is the point nearest to all viewing axes, its side the median distance of the cameras from it.
+
+    Args:
+        viewmats: [V, 4, 4] float64 world to camera.
+    """
+    centers = camera_centers(viewmats)
+    axes = viewmats[:, 2, :3]
+    # A slight pull towards the cameras' mean settles the case of parallel axes.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [V, 3, 3]
+    mean = centers.mean(axis=0)
+    pull = 1e-3 * len(centers) * np.eye(3)
+    offsets = np.einsum("vij,vj->i", across, centers - mean)
+    focus = mean + np.linalg.solve(across.sum(axis=0) + pull, offsets)
+    side = float(np.median(np.linalg.norm(centers - focus, axis=1)))
+    random = np.random.default_rng(0)
+    return focus + random.uniform(-0.5, 0.5, (NUM_RANDOM_POINTS, 3)) * (side or 1.0)
+
+
+def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, str]:
+    """Points for a capture without any, the same for the same cameras, and how they were drawn.
+
+    `random_points` serve, where all views see enough of them. In proportion to the views that do not, part
+    of them is drawn within these views instead: between half of the cameras' extent, or less where cameras stand
+    closer, and ten times it.
+
+    Args:
+        viewmats: [V, 4, 4] float64 world to camera.
+        Ks: [V, 3, 3] float64 intrinsics.
+        sizes: [V, 2] (width, height).
+
+    Returns:
+        [`NUM_RANDOM_POINTS`, 3] float64, and words that go on from "random points".
+    """
+    points = random_points(viewmats)
+    how = "about what the cameras look at"
+    lacking = shares_with_points(points[:PROBES], viewmats, Ks, sizes) < ENOUGH_CELLS
+    if not lacking.any():
+        return points, how
+    count = round(len(points) * lacking.mean())
+    bounds = np.tile(_depth_bounds(camera_centers(viewmats)), (int(lacking.sum()), 1))
+    within = points_in_views(viewmats[lacking], Ks[lacking], sizes[lacking], bounds, count)
+    if not np.isfinite(within).all():  # by poses or intrinsics that the capture's check names
+        return points, how
+    rest = len(points) - count
+    cameras = f"{len(bounds):,} of {len(lacking):,} cameras"
+    if rest == 0:
+        return within, f"before the {len(bounds):,} cameras, which do not look at one thing"
+    how = f"of which {rest:,} are {how}, {count:,} before {cameras} that do not see these"
+    return np.concatenate([points[:rest], within]), how
+
+
+def shares_with_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """[V] float64: share of the cells of a grid (`CELLS`) over each view's image that have a point in them.
+
+    Args:
+        points: [M, 3] float64.
+        viewmats, Ks, sizes: as for `starting_points`.
+    """
+    columns, rows = CELLS
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        to_cells = Ks @ viewmats[:, :3]  # [V, 3, 4], in cells in place of pixels
+        to_cells[:, :2] *= (CELLS / np.asarray(sizes, dtype=np.float64))[:, :, None]
+    homogeneous = np.column_stack([points, np.ones(len(points))]).T  # [4, M]
+    shares = []
+    for part in np.array_split(to_cells, -(-len(to_cells) * len(points) // PROJECTED_AT_ONCE)):
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            x, y, depth = np.moveaxis(part @ homogeneous, 1, 0)  # each [v, M]
+            x, y = x / depth, y / depth
+            inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < columns) & (y < rows)
+        found = np.zeros((len(part), rows, columns), dtype=bool)
+        found[inside.nonzero()[0], y[inside].astype(int), x[inside].astype(int)] = True
+        shares.append(found.mean(axis=(1, 2)))
+    return np.concatenate(shares)
+
+
+def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
+    """Nearest and farthest depth that cameras at `centers` [V, 3] can tell from others, as a guess.
+
+    The extent is the median distance from the mean. Along a path, what is seen is nearer than that: the nearest depth
+    is the geometric mean of extent and spacing, at most half the extent.
+    """
+    mean = centers[0] + (centers - centers[0]).mean(axis=0)
+    extent = float(np.median(np.linalg.norm(centers - mean, axis=1)))
+    if extent <= 1e-12 * np.abs(centers).max():  # all in one place but for rounding
+        return 0.5, 10.0
+    if not np.isfinite(extent):
+        return extent, extent
+    # Cameras of a rig stand in one place: the spacing is between places.
+    rounded = np.round(((centers - mean) / (LEAST_SPACING * extent)).clip(-1e15, 1e15))
+    places = torch.from_numpy(np.unique(rounded, axis=0))
+    spacing = float(mean_neighbor_distances(places, 1).median()) * LEAST_SPACING if len(places) > 1 else 1.0
+    return extent * min(0.5, spacing**0.5), extent * 10.0
+
+
+def points_in_views(
+    viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, bounds: np.ndarray, count: int
+) -> np.ndarray:
+    """[M, 3] float64 points drawn at random, the same for the same arguments.
+
+    A view and a place in it are drawn evenly, and the inverse of the depth: so the points lie as densely in the image
+    as in depth, as far as parallax can tell depths apart.
+
+    Args:
+        viewmats: [V, 4, 4] float64, world to camera.
+        Ks: [V, 3, 3] float64 intrinsics.
+        sizes: [V, 2] (width, height).
+        bounds: [V, 2] float64, nearest and farthest depth.
+        count: M.
+    """
+    random = np.random.default_rng(0)
+    views = random.integers(0, len(viewmats), count)
+    pixels = random.uniform(size=(count, 2)) * sizes[views]
+    shares = random.uniform(size=count)
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused by the capture's check
+        near, far = (1.0 / bounds[views]).T
+        depths = 1.0 / (far + shares * (near - far))
+        rays = (pixels - Ks[views, :2, 2]) / Ks[views][:, [0, 1], [0, 1]]  # [M, 2]
+        in_camera = depths[:, None] * np.column_stack([rays, np.ones(len(rays))])
+        return np.einsum("mji,mj->mi", viewmats[views, :3, :3], in_camera - viewmats[views, :3, 3])
+
+
+def colors_in_photos(points: Tensor, cameras: Cameras, photos: Photos, masks: PixelMasks | None = None) -> Tensor:
+    """[M, 3] uint8: for each point the mean colour of the pixels at which photos see it, hidden or not.
+
+    Masked pixels do not count, and transparent ones by their alpha. Points that none sees get the mean of the others;
+    grey where there is none.
+
+    Args:
+        points: [M, 3] float32.
+        cameras, photos: of V views in the same coordinates, of which at most `COLOR_VIEWS`, evenly spread, are used.
+        masks: which pixels count, on the CPU; None for all.
+    """
+    cameras, points = cameras.to("cpu", torch.float32), points.cpu()
+    sums, counts = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
+    for view in evenly(len(photos), COLOR_VIEWS):
+        viewmat, (width, height) = cameras.viewmats[view], photos.sizes[view].tolist()
+        in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+        depths = in_camera[:, 2]
+        x, y = ((in_camera @ cameras.Ks[view].T)[:, :2] / depths.clamp(min=1e-9)[:, None]).unbind(dim=1)
+        inside = ((depths > 1e-9) & (x >= 0) & (y >= 0) & (x < width) & (y < height)).nonzero()[:, 0]
+        pixels = y[inside].long().clamp(max=height - 1) * width + x[inside].long().clamp(max=width - 1)
+        start = int(pixel_offsets(photos.sizes)[view])
+        seen = photos.stored[(start + pixels).to(photos.stored.device)].cpu().float()
+        if not photos.transparent:
+            seen = torch.nn.functional.pad(seen, (0, 1), value=255.0)
+        if masks is not None:
+            seen *= masks.image(view).reshape(-1)[pixels, None]
+        sums.index_add_(0, inside, seen[:, :3])  # which are multiplied by alpha already
+        counts.index_add_(0, inside, seen[:, 3:] / 255.0)
+    others = sums.sum(dim=0) / counts.sum() if counts.any() else torch.full((3,), 128.0)
+    return torch.where(counts > 0, sums / counts.clamp(min=1e-9), others).round().to(torch.uint8)

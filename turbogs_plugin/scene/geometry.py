@@ -1,0 +1,82 @@
+"""Geometry of cameras (world-to-camera matrices: x right, y down, z forward) and of points."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Tensor
+
+LARGEST_DEVIATION = 1e-2
+"""Largest deviation of axes' products from a rotation's."""
+
+
+def camera_centers(viewmats: np.ndarray) -> np.ndarray:
+    """[V, 3] of [V, 4, 4] world to camera."""
+    return -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """At most `most` of `count` views, evenly spread, ascending; with the first and the last where there are two."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()
+
+
+def viewmat_of_pose(axes: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """[4, 4] float64 world to camera of a camera's place in the world.
+
+    Args:
+        axes: [3, 3] float64, whose columns are the camera's axes in the world: right, down, forward. Decimals that were
+            cut when it was written are made up for: the nearest rotation is taken.
+        center: [3] float64.
+
+    Raises:
+        ValueError: the numbers are not finite, or the axes not a rotation.
+    """
+    if not (np.isfinite(axes).all() and np.isfinite(center).all()):
+        raise ValueError("has numbers that are not finite")
+    with np.errstate(over="ignore", invalid="ignore"):
+        if not np.abs(axes.T @ axes - np.eye(3)).max() < LARGEST_DEVIATION or np.linalg.det(axes) < 0:
+            raise ValueError("is not a rotation and a translation")
+        left, _, right = np.linalg.svd(axes)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = (left @ right).T
+        viewmat[:3, 3] = -viewmat[:3, :3] @ center
+    return viewmat
+
+
+def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """[4, 4] float64 world to camera of a camera at `center` with `target` in the middle of its image.
+
+    Args:
+        center, target: [3] float64.
+        up: [3], not parallel to the view; it points upwards in the image.
+    """
+    forward = target - center
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    viewmat[:3, 3:] = -viewmat[:3, :3] @ center[:, None]
+    return viewmat
+
+
+def quaternions(matrices: np.ndarray) -> np.ndarray:
+    """[C, 4] wxyz of rotations [C, 3, 3]."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(matrices).as_quat(scalar_first=True)
+
+
+def mean_neighbor_distances(points: Tensor, neighbors: int) -> Tensor:
+    """[M]: mean distance of each point to its `neighbors` nearest other points (fewer, if the cloud has fewer).
+
+    Args:
+        points: [M, 3] float, finite, M >= 2, on any device. Points may coincide.
+        neighbors: at least 1.
+    """
+    from scipy.spatial import cKDTree
+
+    places = points.cpu()
+    _, nearest = cKDTree(places.numpy()).query(places.numpy(), min(neighbors + 1, len(places)), workers=-1)
+    # In the points' own precision. The first is the point itself, or another one in its place.
+    x, y, z = ((places[:, None, axis] - places[nearest][:, :, axis]).square() for axis in range(3))
+    return (x + y + z).sort(dim=1).values[:, 1:].sqrt().mean(dim=1).to(points.device)
