@@ -7,7 +7,7 @@ import json
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -127,10 +127,11 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     scratch = out / "reconstruction"
     new = _begin(found, out, scratch / "photos.json")
     unused = "" if masks else misnamed(dict.fromkeys((photos, place.parent, place)))
-    with _held(scratch):
+    solution = _read_solution(out)
+    with _held(scratch) if solution is None else nullcontext():  # a finished one may lie where nothing can be written
         place_masks(masks, out / "masks", scratch / "masks.txt")
         try:
-            solution = _read_solution(out) or _reconstruct(found, out, unread(photos))
+            solution = solution or _reconstruct(found, out, unread(photos))
         except InputError:
             if new:
                 shutil.rmtree(missing[-1] if missing else scratch, ignore_errors=True)
@@ -185,9 +186,8 @@ def _begin(photos: Sequence[PhotoFile], out: Path, listed: Path) -> bool:
 @contextmanager
 def _held(scratch: Path) -> Iterator[None]:
     """While entered, no other process makes the scene; the system frees the lock of a process that is killed."""
-    lock = FileLock(scratch / "lock")
     try:
-        lock.acquire(timeout=0 if _read_solution(scratch.parent) is None else -1)  # a finished one takes moments
+        lock = FileLock(scratch / "lock", blocking=False).acquire()
     except Timeout:
         raise InputError(f"'{scratch.parent}' is being made by another process: wait for it") from None
     with lock:
@@ -197,7 +197,10 @@ def _held(scratch: Path) -> Iterator[None]:
 def _read_solution(out: Path) -> Solution | None:
     """What an earlier call came to; None where none was finished."""
     text = read_text(out / "reconstruction" / "solution.json")
-    return Solution(out, **json.loads(text)) if text and (out / "sparse" / "0").is_dir() else None
+    try:
+        return Solution(out, **json.loads(text)) if text and (out / "sparse" / "0").is_dir() else None
+    except (ValueError, TypeError):  # it is damaged: made anew
+        return None
 
 
 def _reconstruct(photos: Sequence[PhotoFile], out: Path, others: str) -> Solution:

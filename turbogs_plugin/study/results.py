@@ -194,16 +194,13 @@ class StudyFolder:
         """
         path = (self.cells / key.file).with_suffix(".lock")
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(path)
         try:
-            lock.acquire(blocking=False)
+            lock = FileLock(path, blocking=False).acquire()
         except Timeout:
             yield False
             return
-        try:
+        with lock:
             yield True
-        finally:
-            lock.release()
 
     def write_study(self, study: Study) -> None:
         """Write ``results.json``."""
@@ -247,7 +244,7 @@ def _text(study: Study) -> str:
             "curve": {name: [_rounded(name, value) for value in column] for name, column in result.curve.items()},
             "final": {name: _rounded(name, value) for name, value in result.final.items()},
         }
-        cells.append(json.dumps(entry, ensure_ascii=False))
+        cells.append(json.dumps(entry, ensure_ascii=False, separators=(",", ":")))
     lines.append('"cells": [\n' + ",\n".join(cells) + "\n]")
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
