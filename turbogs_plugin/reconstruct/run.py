@@ -76,7 +76,7 @@ class Solve:
     """A model with what the matches say about it.
 
     Args:
-        model: that with most photos.
+        model: the one with most photos.
         sizes: photos of each model, the largest first.
         agreement: of all matches with the model.
         groups: photos that the matches put together, as indices into the agreement's names, the largest group first.
@@ -165,7 +165,7 @@ def reconstruct_beside(config: Config, run: Path) -> Path:
 
 
 def _begin(photos: Sequence[PhotoFile], out: Path, listed: Path) -> bool:
-    """Make the folder of a scene and list its photos, or see that an earlier call listed the same; whether it is new.
+    """Make the folder of a scene and list its photos, or see that an earlier call listed them, too; whether it is new.
 
     Raises:
         InputError: the folder holds something else, or a reconstruction of other photos.

@@ -218,7 +218,7 @@ def _require_working(device: torch.device) -> None:
         synchronize(device)
     except RuntimeError as error:
         reason = str(error).splitlines()[0]
-        raise TrainingStopped(f"the GPU no longer answers this process ({reason}): the same command goes on") from None
+        raise TrainingStopped(f"the GPU no longer answers this process ({reason}): call again to go on") from None
     free_device_memory(device)
 
 
@@ -236,7 +236,7 @@ def _train_on_gpus(gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder
                     process.terminate()
                 raise
     except BrokenProcessPool:
-        raise TrainingStopped("a process of this study was killed: the same command goes on") from None
+        raise TrainingStopped("a process of this study was killed: call again to go on") from None
 
 
 def _work(gpu: int, gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder, Provenance]) -> None:
