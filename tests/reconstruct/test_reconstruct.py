@@ -352,27 +352,6 @@ def test_the_command_refuses_in_one_line(tmp_path, turbogs):
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
-@pytest.mark.parametrize("verb", ["train", "plan"])
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("few/a.jpg", "has 1 photo"),
-        ("phone/IMG_1.HEIC", "nor photos; 1 file is of a kind that is not read (IMG_1.HEIC): convert to JPEG"),
-        ("films/walk.mp4", "nor photos; walk.mp4 is a video: take photos out of it"),
-        ("walk.mp4", "no such scene: walk.mp4 is a video"),
-    ],
-)
-def test_what_is_no_capture_is_refused_in_one_line(tmp_path, turbogs, verb, name, message):
-    place = tmp_path / "captures"
-    (place / name).parent.mkdir(parents=True)
-    Image.new("RGB", (64, 48)).save(place / name, format="JPEG")
-    scene = place / name.partition("/")[0]
-    out = ("--out", tmp_path / "runs" / "run") if verb == "train" else ()
-    code, printed, err = turbogs(verb, scene, "--device", "cpu", *out)
-    assert (code, printed) == (2, "") and err.count("\n") == 1 and message in err
-    assert [path.name for path in tmp_path.iterdir()] == ["captures"]
-
-
 def test_photos_that_are_not_read_are_noted(solved, tmp_path, monkeypatch):
     photos = Path(shutil.copytree(solved[0].parent, tmp_path / "photos"))
     (photos / "images" / "IMG_1.HEIC").write_bytes(b"x")

@@ -8,7 +8,7 @@ whether its matches agree with the cameras as they were solved. Where a group of
 that contradict the solve than matches that agree, the other explanation is the better one.
 
 Grouping is correlation clustering by greedy edge contraction (GAEC; Keuper et al., Efficient decomposition of image and
-mesh graphs by lifted multicuts, ICCV 2015). The idea of contradicting evidence is that of Zach et al., Disambiguating
+mesh graphs by lifted multicuts, ICCV 2015). The idea of contradicting evidence is from Zach et al., Disambiguating
 visual relations using loop constraints, CVPR 2010.
 """
 

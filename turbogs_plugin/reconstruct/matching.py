@@ -1,4 +1,4 @@
-"""Pairs of photos to match: all of few photos; of many, those that are close by GPS or by order."""
+"""Pairs of photos to match: all pairs of few photos; of many, pairs that are close by GPS or by order."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class PhotoFile:
         path: of the file.
         size: (width, height) of the upright photo.
         turned: EXIF says that the file is not upright.
-        lens: photos of the same lens have the same text: camera, focal length and size.
+        lens: text that is equal for photos of one lens: camera, focal length and size.
         stamp: bytes and time of the last change in ns, by which a later call knows the file again.
     """
 
@@ -55,7 +55,7 @@ def list_photos(folder: Path) -> tuple[Path, list[Path]]:
     """The folder that photos' names are relative to, and the photos in the order of their names.
 
     Raises:
-        InputError: no folder, or that of a run; fewer than `FEWEST_PHOTOS` photos.
+        InputError: no folder, or a run's; fewer than `FEWEST_PHOTOS` photos.
     """
     reason = unread(folder)
     if not folder.is_dir():

@@ -7,7 +7,7 @@ import json
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -76,7 +76,7 @@ class Solve:
     """A model with what the matches say about it.
 
     Args:
-        model: that with most photos.
+        model: the one with most photos.
         sizes: photos of each model, the largest first.
         agreement: of all matches with the model.
         groups: photos that the matches put together, as indices into the agreement's names, the largest group first.
@@ -127,10 +127,11 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     scratch = out / "reconstruction"
     new = _begin(found, out, scratch / "photos.json")
     unused = "" if masks else misnamed(dict.fromkeys((photos, place.parent, place)))
-    with _held(scratch):
+    solution = _read_solution(out)
+    with _held(scratch) if solution is None else nullcontext():  # a finished one may lie where nothing can be written
         place_masks(masks, out / "masks", scratch / "masks.txt")
         try:
-            solution = _read_solution(out) or _reconstruct(found, out, unread(photos))
+            solution = solution or _reconstruct(found, out, unread(photos))
         except InputError:
             if new:
                 shutil.rmtree(missing[-1] if missing else scratch, ignore_errors=True)
@@ -164,7 +165,7 @@ def reconstruct_beside(config: Config, run: Path) -> Path:
 
 
 def _begin(photos: Sequence[PhotoFile], out: Path, listed: Path) -> bool:
-    """Make the folder of a scene and list its photos, or see that an earlier call listed the same; whether it is new.
+    """Make the folder of a scene and list its photos, or see that an earlier call listed them, too; whether it is new.
 
     Raises:
         InputError: the folder holds something else, or a reconstruction of other photos.
@@ -185,9 +186,8 @@ def _begin(photos: Sequence[PhotoFile], out: Path, listed: Path) -> bool:
 @contextmanager
 def _held(scratch: Path) -> Iterator[None]:
     """While entered, no other process makes the scene; the system frees the lock of a process that is killed."""
-    lock = FileLock(scratch / "lock")
     try:
-        lock.acquire(timeout=0 if _read_solution(scratch.parent) is None else -1)  # a finished one takes moments
+        lock = FileLock(scratch / "lock", blocking=False).acquire()
     except Timeout:
         raise InputError(f"'{scratch.parent}' is being made by another process: wait for it") from None
     with lock:
@@ -197,7 +197,10 @@ def _held(scratch: Path) -> Iterator[None]:
 def _read_solution(out: Path) -> Solution | None:
     """What an earlier call came to; None where none was finished."""
     text = read_text(out / "reconstruction" / "solution.json")
-    return Solution(out, **json.loads(text)) if text and (out / "sparse" / "0").is_dir() else None
+    try:
+        return Solution(out, **json.loads(text)) if text and (out / "sparse" / "0").is_dir() else None
+    except (ValueError, TypeError):  # it is damaged: made anew
+        return None
 
 
 def _reconstruct(photos: Sequence[PhotoFile], out: Path, others: str) -> Solution:

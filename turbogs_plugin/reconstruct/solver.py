@@ -84,7 +84,7 @@ def match_features(database: Path, scratch: Path, pairs: Sequence[tuple[str, str
 
 
 def solve_cameras(database: Path, images: Path, scratch: Path) -> list[pycolmap.Reconstruction]:
-    """COLMAP's incremental mapping from one seed: the models, that with most photos first."""
+    """Models by COLMAP's incremental mapping from one seed, the one with most photos first."""
     pycolmap = _pycolmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = torch.get_num_threads(), 0

@@ -48,7 +48,7 @@ class CellResult:
         provenance: machine, versions and commit; None where they were not recorded.
         settings: the configuration that was asked for, flat.
         planned: settings that plan and budgets made of it, where they differ.
-        curve: column -> [E] its values at the evaluations, in the order of training. Columns: those of `CURVE`.
+        curve: column, of `CURVE`, -> [E] its values at the evaluations, in the order of training.
         final: measure -> value of the final model: the curve's last values; ``worst_psnr`` of the worst test view;
             ``refined_psnr`` and ``refined_ssim`` by refined test cameras; ``lpips``, ``flip``; ``fps``, test views
             rendered a second; ``peak_mib``, peak of the GPU's tensors while training; ``wall_seconds`` of a run, from
@@ -123,7 +123,7 @@ def curve_and_final(history: Sequence[Evaluation]) -> tuple[dict[str, list[float
 
 
 def measured(values: Mapping[str, float | None]) -> dict[str, float]:
-    """Those values that are there and finite."""
+    """The values that are there and finite."""
     return {name: value for name, value in values.items() if value is not None and math.isfinite(value)}
 
 
@@ -194,16 +194,13 @@ class StudyFolder:
         """
         path = (self.cells / key.file).with_suffix(".lock")
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(path)
         try:
-            lock.acquire(blocking=False)
+            lock = FileLock(path, blocking=False).acquire()
         except Timeout:
             yield False
             return
-        try:
+        with lock:
             yield True
-        finally:
-            lock.release()
 
     def write_study(self, study: Study) -> None:
         """Write ``results.json``."""
@@ -247,7 +244,7 @@ def _text(study: Study) -> str:
             "curve": {name: [_rounded(name, value) for value in column] for name, column in result.curve.items()},
             "final": {name: _rounded(name, value) for name, value in result.final.items()},
         }
-        cells.append(json.dumps(entry, ensure_ascii=False))
+        cells.append(json.dumps(entry, ensure_ascii=False, separators=(",", ":")))
     lines.append('"cells": [\n' + ",\n".join(cells) + "\n]")
     return "{\n" + ",\n".join(lines) + "\n}\n"
 

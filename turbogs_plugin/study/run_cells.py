@@ -148,7 +148,10 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
                 if folder.ended(key):  # another process has trained it
                     total -= 1
                     continue
-                scene, digest, loading = _load_capture(config)
+                given = config.scene
+                scene, digest, loading = _loaded(
+                    given.path, given.factor, given.test_every, config.train.refine_cameras
+                )
                 if any(cell.scene == key.scene and cell.capture not in ("", digest) for cell in finished.values()):
                     raise InputError(
                         f"'{key.scene}' has other photos or cameras than its kept cells: choose a new --out"
@@ -174,16 +177,11 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
 
 @lru_cache(maxsize=2)  # with refined cameras and without
 def _loaded(path: str, factor: int, test_every: int, refined: bool) -> tuple[Scene, str, float]:
+    """Capture, its digest, and the seconds in which it was loaded. It stays for the next cells."""
     started = time.perf_counter()
     scene, cameras = load_and_find(Path(path), factor, test_every)
     own = with_cameras(scene, cameras, refined)
     return own, capture_digest(scene), time.perf_counter() - started
-
-
-def _load_capture(config: Config) -> tuple[Scene, str, float]:
-    """Capture of a cell, its digest, and the seconds in which it was loaded. It stays for the next cells."""
-    scene = config.scene
-    return _loaded(scene.path, scene.factor, scene.test_every, config.train.refine_cameras)
 
 
 def _reason(error: Exception) -> str:
@@ -218,7 +216,7 @@ def _require_working(device: torch.device) -> None:
         synchronize(device)
     except RuntimeError as error:
         reason = str(error).splitlines()[0]
-        raise TrainingStopped(f"the GPU no longer answers this process ({reason}): the same command goes on") from None
+        raise TrainingStopped(f"the GPU no longer answers this process ({reason}): call again to go on") from None
     free_device_memory(device)
 
 
@@ -236,7 +234,7 @@ def _train_on_gpus(gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder
                     process.terminate()
                 raise
     except BrokenProcessPool:
-        raise TrainingStopped("a process of this study was killed: the same command goes on") from None
+        raise TrainingStopped("a process of this study was killed: call again to go on") from None
 
 
 def _work(gpu: int, gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder, Provenance]) -> None:

@@ -1,4 +1,4 @@
-"""Runs side by side as a study: runs that were asked the same, but for the seed, are seeds of one variant."""
+"""Runs side by side as a study: runs with equal settings, but for the seed, are seeds of one variant."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ UNSHARED = ("scene.", "report.", "train.seed", "train.checkpoint_every", "train.
 def study_of_runs(paths: Sequence[Path]) -> Study:
     """The runs as cells of a study. A variant has the name of its first run; the first run's variant is the baseline.
 
-    Runs are of one variant where the same was asked for. What plan and budgets make of it does not count, for it
-    differs from machine to machine and from seed to seed.
+    Runs are of one variant where they were asked for equal settings. What plan and budgets make of these does not
+    count, for it differs from machine to machine and from seed to seed.
 
     Raises:
-        InputError: no run there, one that is not finished, or two with the same settings and seed.
+        InputError: no run there, one that is not finished, or two with equal settings and one seed.
     """
     variants: dict[str, dict[str, Any]] = {}  # name -> what its runs were asked for, without what is unshared
     scenes: dict[str, tuple[object, ...]] = {}  # name -> path, factor and test views
