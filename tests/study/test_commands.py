@@ -110,9 +110,9 @@ def test_what_a_call_asked_for_makes_no_study_stale_but_a_change_of_its_ablation
     assert "Stale" not in (study / "report.md").read_text()
     made = StudyFolder(study).read_study()
     assert (made.results[0].overrides, made.results[0].steps) == ([*SETTINGS], 4)
-    made.ablation.variants["full"] = ["loss.epsilon=0.5"]
+    made.ablation.variants["full"] = ["loss.ncc_weight=0.5"]
     (line,) = changed_since(made)
-    assert line.markdown().endswith("Then: loss.epsilon 0.001 (now 0.5).")
+    assert line.markdown().endswith("Then: loss.ncc_weight 1.0 (now 0.5).")
 
 
 def test_a_process_warms_up_once_for_a_variant_and_capture(turbogs, small, capture, tmp_path, monkeypatch):
@@ -523,7 +523,7 @@ def test_runs_that_were_asked_the_same_are_seeds_whatever_plan_and_budgets_made_
         run("c", 2, 1500, "budget.time=20s", fitted=capped),
         run("capped", 0, 1500, "budget.time=20s", *capped),
         run("longer", 0, 2600, "budget.time=30s"),
-        run("other", 0, 2600, "budget.time=20s", "density.prune_opacity=0.02"),
+        run("other", 0, 2600, "budget.time=20s", "density.percent_dense=0.02"),
         run("free", 0, 2600),
         run("free-2", 1, 2471),
     ]
@@ -538,7 +538,7 @@ def test_runs_that_were_asked_the_same_are_seeds_whatever_plan_and_budgets_made_
 
 
 def test_a_run_in_a_folder_called_as_a_configuration_is_not_stale(tmp_path):
-    assert changed_since(study_of_runs([a_run(tmp_path / "turbogs", 30, "density.prune_opacity=0.02")])) == []
+    assert changed_since(study_of_runs([a_run(tmp_path / "turbogs", 30, "density.percent_dense=0.02")])) == []
 
 
 def test_seconds_on_the_wall_are_compared_where_a_run_recorded_them(turbogs, tmp_path):
