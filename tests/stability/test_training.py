@@ -249,7 +249,6 @@ def test_learning_rates_far_too_large(capture, tmp_path, optimizer, factor):
 @pytest.mark.parametrize(
     "overrides",
     [
-        ("density.prune_opacity=0.99",),
         ("density.prune_score_fraction=0.999", "density.final_keep=1e-9"),
         ("density.choose_by=squares", "density.prune_score_fraction=0.999", "density.final_keep=1e-9"),
         ("density.max_gaussians=1",),

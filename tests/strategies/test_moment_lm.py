@@ -84,18 +84,6 @@ def test_equals_numpy(views, config):
             assert np.abs(change[i] / adam - 1).max() > 0.1  # or the rows had no say here
 
 
-def test_rows_matter():
-    """The views' rows and their sum are different models of the same gradient."""
-    results = []
-    for rows in ("views", "summed"):
-        gaussians = make_gaussians(4)
-        optimizer = MomentLMOptimizer(rows=rows)
-        optimizer.setup(gaussians)
-        optimizer.step(gaussians, make_gradients(3, 4), STEP)
-        results.append(gaussians.means)
-    assert not torch.allclose(*results, rtol=1e-12, atol=0)
-
-
 def test_consistent_gradients_take_the_gauss_newton_step():
     """One view, L = r^2 / 2, rates that would overshoot a thousandfold: the linear model of the residual ends at zero,
     g . delta = -2 L, but for the damping's share (Sherman-Morrison, and m = g at the first step)."""
@@ -135,16 +123,6 @@ def test_without_rows_it_is_adam_to_the_last_bit(dtype, without):
         lm.step(lm_gaussians, gradients, STEP)
         adam.step(adam_gaussians, gradients, STEP)
     assert equal(lm_gaussians, adam_gaussians)
-
-
-def test_tends_to_adam_as_curvature_vanishes():
-    lm_gaussians, adam_gaussians = make_gaussians(9), make_gaussians(9)
-    lm, adam = MomentLMOptimizer(curvature=1e-12), SparseAdam()
-    lm.setup(lm_gaussians)
-    adam.setup(adam_gaussians)
-    lm.step(lm_gaussians, make_gradients(3, 9), STEP)
-    adam.step(adam_gaussians, make_gradients(3, 9), STEP)
-    torch.testing.assert_close(lm_gaussians.means, adam_gaussians.means, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])

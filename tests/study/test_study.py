@@ -78,8 +78,7 @@ def test_what_a_variant_does_not_name_is_as_in_the_base(name):
 
 
 DEFAULTS_THAT_DIFFER = {
-    "3dgs": {"optimizer.learning_rates.final_factor", "optimizer.eps"},
-    "sparse-adam": {"optimizer.eps"},
+    "3dgs": {"optimizer.learning_rates.final_factor"},
     "fastgs": {"density.refine_every"},
 }
 """A type's own values, where a variant is meant to have them."""

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,6 +29,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.report.run_report import write_report
+from turbogs_plugin.strategies.density import fastgs, gsplat_default
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import read_history
@@ -249,11 +251,14 @@ def test_a_model_without_gaussians_ends_the_run_with_a_reason(capture, tmp_path,
     "density",
     [
         ("density.type=error_driven",),
-        ("density.type=gsplat_default", "density.refine_start_iter=2", "density.grow_grad2d=1e-6"),
-        ("density.type=fastgs", "density.refine_from=3", "density.consistency=0.01"),
+        ("density.type=gsplat_default", "density.refine_start_iter=2"),
+        ("density.type=fastgs", "density.refine_from=3"),
     ],
 )
-def test_rows_are_in_the_order_of_space_whatever_added_them(capture, density):
+def test_rows_are_in_the_order_of_space_whatever_added_them(capture, density, monkeypatch):
+    monkeypatch.setattr(fastgs, "CONSISTENCY", 0.01)
+    eager = partial(gsplat_default._FilledStrategy, grow_grad2d=1e-6)
+    monkeypatch.setattr(gsplat_default, "_FilledStrategy", eager)
     shared = [text for text in TINY if not text.startswith("density.")]
     overrides = [*shared, "train.device=cpu", *density, "density.refine_every=3"]
     start = ["density.refine_from=2"] if "error" in density[0] else []
