@@ -111,15 +111,19 @@ def read_poses(folder: Path, suffix: str, model: ColmapModel) -> dict[int, np.nd
     rigs, frames = folder / f"rigs{suffix}", folder / f"frames{suffix}"
     if not (rigs.is_file() and frames.is_file()):
         return poses
-    in_rig: dict[tuple[int, ...], np.ndarray] = {}
+    in_rig: dict[tuple[int, int, int], np.ndarray] = {}
+    known = set()
     for rig, sensors in _binary_rigs(rigs) if suffix == ".bin" else _text_rigs(rigs):
-        for sensor, pose in sensors:
-            in_rig[(rig, *sensor)] = _require_pose(rigs, f"rig {rig}", pose)
+        known.add(rig)
+        for (kind, sensor), pose in sensors:
+            in_rig[rig, kind, sensor] = _require_pose(rigs, f"rig {rig}", pose)
     for frame, rig, pose, members in _binary_frames(frames) if suffix == ".bin" else _text_frames(frames):
+        if rig not in known:
+            raise _damaged(frames, f"frame {frame} has rig {rig}, which {rigs.name} does not have")
         from_world = _viewmat(_require_pose(frames, f"frame {frame}", pose))
-        for *sensor, image in members:
-            if image in poses and sensor[0] == CAMERA_SENSOR:
-                place = in_rig.get((rig, *sensor))
+        for kind, sensor, image in members:
+            if image in poses and kind == CAMERA_SENSOR:
+                place = in_rig.get((rig, kind, sensor))
                 poses[image] = from_world if place is None else _viewmat(place) @ from_world
     return poses
 
@@ -168,14 +172,17 @@ def _binary_frames(path: Path) -> Frames:
 
 def _text_rigs(path: Path) -> Rigs:
     for line, words in _text_records(path):
-        sensors, rest = [], words[4:]
+        sensors, rest, count = [], words[4:], 1
         try:
+            _ = SENSORS.index(words[2]), int(words[3])  # the reference sensor, which is in the middle of the rig
             while rest:
                 if int(rest[2]):
                     sensors.append(((SENSORS.index(rest[0]), int(rest[1])), np.array(rest[3:10], np.float64)))
                     if sensors[-1][1].shape != (7,):
                         raise ValueError
-                rest = rest[10 if int(rest[2]) else 3 :]
+                rest, count = rest[10 if int(rest[2]) else 3 :], count + 1
+            if count != int(words[1]):
+                raise ValueError
             yield int(words[0]), sensors
         except (ValueError, IndexError):
             raise _line_damaged(path, line, "a rig: identifier, count of sensors, and the sensors") from None
