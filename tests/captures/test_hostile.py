@@ -18,7 +18,7 @@ from turbogs_plugin.model.ply import load_ply, save_ply
 from turbogs_plugin.types import Gaussians
 
 NAN, INF, HUGE = struct.pack("<d", np.nan), struct.pack("<d", np.inf), struct.pack("<Q", 2**60)
-FILES = ("cameras", "images", "points3D")
+FILES = ("cameras", "images", "points3D", "rigs", "frames")
 MEMORY = 32 * 2**20
 """Python and numpy may allocate this much for files of some 50 kB, however large their counts."""
 
@@ -138,6 +138,7 @@ def test_counts_beyond_the_file(capture, tmp_path, file, count):
         ("images", 8 + 4, NAN, "image 1 has a pose that is not finite"),
         ("images", 8 + 4, bytes(32), "damaged: .* zero rotation; copy or reconstruct it again"),
         ("images", 8 + 4 + 32, INF, "image 1 has a pose that is not finite"),
+        ("frames", 8 + 8 + 32, NAN, "frame 1 has a pose that is not finite"),
         ("points3D", 8 + 8, NAN, "1 of .* 3D points are not finite: export or reconstruct it again"),
         ("images", 8 + 60, struct.pack("<I", 7), "has camera 7, which"),
         ("cameras", 8 + 4, struct.pack("<i", 99), "unknown model 99"),

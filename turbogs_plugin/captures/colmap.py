@@ -23,6 +23,7 @@ from turbogs_plugin.captures.colmap_files import (
     ModelImage,
     count_images,
     read_model,
+    read_poses,
 )
 from turbogs_plugin.captures.decoding import photo_size
 from turbogs_plugin.captures.photo_files import FOLDER_DEPTH, find_photo_folder, folders_in
@@ -137,7 +138,8 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     made: dict[tuple, Lens] = {}
     lenses = {image.camera: _lens(model.cameras[image.camera], folder, made) for image in images}
     lens_of_view = tuple(lenses[image.camera] for image in images)
-    viewmats = np.array([_viewmat(image) for image in images]).reshape(-1, 4, 4)
+    poses = read_poses(folder, suffix, model)
+    viewmats = np.array([poses[image.number] for image in images]).reshape(-1, 4, 4)
     pairs = list(zip(cameras, lens_of_view, strict=True))
     intrinsics = np.array([camera.calibration_matrix() if lens is None else lens.K for camera, lens in pairs])
     sizes = np.array([(camera.width, camera.height) if lens is None else lens.size for camera, lens in pairs])
@@ -170,15 +172,6 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
         alpha="mask",
         observations=None if drawn else _observations(model, images, lenses),
     ).checked(folder)
-
-
-def _viewmat(image: ModelImage) -> np.ndarray:
-    """[4, 4] float64 world to camera."""
-    rotation = load_pycolmap().Rotation3d(np.roll(image.quat, -1))
-    rotation.normalize()
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation.matrix(), image.translation
-    return viewmat
 
 
 def _lens(camera: pycolmap.Camera, model: Path, made: dict[tuple, Lens]) -> Lens | None:

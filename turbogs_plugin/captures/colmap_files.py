@@ -2,7 +2,7 @@
 
 pycolmap makes an object of every feature, of which captures have millions, trusts a count of 2^60 in a damaged file,
 and refuses reconstructions of which a script took a part out. So the records are read here: no count allocates more
-than its file holds. Each image has its own pose in these files, so rigs and frames are not needed.
+than its file holds.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error"
 """A point, without its track."""
 NO_POINT = np.uint64(2**64 - 1)
 TRACK_ELEMENT_BYTES = 8
+SENSORS = ("CAMERA", "IMU")
+CAMERA_SENSOR = 0
+"""Kinds of sensors of a rig, and a camera's number among them."""
 SMALLEST_IMAGE, SMALLEST_CAMERA = 73, 24
 """Bytes of an image with a name of one letter and without features; of a camera without parameters."""
 LONGEST_NAME = 4096
@@ -40,16 +43,14 @@ class ModelImage:
         number: COLMAP's identifier.
         camera: identifier of its camera.
         name: as the file has it, below the folder of the photos.
-        quat: [4] float64 wxyz, world to camera, of any length.
-        translation: [3] float64.
+        pose: [7] float64, world to camera: quaternion wxyz of any length, translation. `read_poses` has the frames'.
         features: [n] of `FEATURE`.
     """
 
     number: int
     camera: int
     name: str
-    quat: np.ndarray
-    translation: np.ndarray
+    pose: np.ndarray
     features: np.ndarray
 
 
@@ -81,9 +82,7 @@ def read_model(folder: Path, suffix: str) -> ColmapModel:
             raise _damaged(
                 images, f"image {image.number} has camera {image.camera}, which {cameras.name} does not have"
             )
-        pose = np.concatenate([image.quat, image.translation])
-        if not np.isfinite(pose).all() or not 1e-6 < np.abs(image.quat).max() < 1e6:
-            raise _damaged(images, f"image {image.number} has a pose that is not finite, or a zero rotation")
+        _require_pose(images, f"image {image.number}", image.pose)
     return ColmapModel(model.cameras, model.images, model.points[np.argsort(model.points["id"], kind="stable")])
 
 
@@ -97,6 +96,110 @@ def count_images(path: Path) -> int:
         return min(announced, path.stat().st_size // SMALLEST_IMAGE)
     except OSError:
         return 0
+
+
+def read_poses(folder: Path, suffix: str, model: ColmapModel) -> dict[int, np.ndarray]:
+    """[4, 4] float64 world to camera of each image, by its identifier.
+
+    A pose is by the image's frame and its camera's place in the rig, where ``rigs`` and ``frames`` are both there and
+    have the image (COLMAP 3.12 and later); else the image's own.
+
+    Raises:
+        InputError: ``rigs`` or ``frames`` are damaged.
+    """
+    poses = {image.number: _viewmat(image.pose) for image in model.images}
+    rigs, frames = folder / f"rigs{suffix}", folder / f"frames{suffix}"
+    if not (rigs.is_file() and frames.is_file()):
+        return poses
+    in_rig: dict[tuple[int, int, int], np.ndarray] = {}
+    known = set()
+    for rig, sensors in _binary_rigs(rigs) if suffix == ".bin" else _text_rigs(rigs):
+        known.add(rig)
+        for (kind, sensor), pose in sensors:
+            in_rig[rig, kind, sensor] = _require_pose(rigs, f"rig {rig}", pose)
+    for frame, rig, pose, members in _binary_frames(frames) if suffix == ".bin" else _text_frames(frames):
+        if rig not in known:
+            raise _damaged(frames, f"frame {frame} has rig {rig}, which {rigs.name} does not have")
+        from_world = _viewmat(_require_pose(frames, f"frame {frame}", pose))
+        for kind, sensor, image in members:
+            if image in poses and kind == CAMERA_SENSOR:
+                place = in_rig.get((rig, kind, sensor))
+                poses[image] = from_world if place is None else _viewmat(place) @ from_world
+    return poses
+
+
+def _require_pose(path: Path, owner: str, pose: np.ndarray) -> np.ndarray:
+    if not np.isfinite(pose).all() or not 1e-6 < np.abs(pose[:4]).max() < 1e6:
+        raise _damaged(path, f"{owner} has a pose that is not finite, or a zero rotation")
+    return pose
+
+
+def _viewmat(pose: np.ndarray) -> np.ndarray:
+    """[4, 4] float64 of a quaternion and a translation [7]."""
+    import pycolmap
+
+    rotation = pycolmap.Rotation3d(np.roll(pose[:4], -1))
+    rotation.normalize()
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation.matrix(), pose[4:]
+    return viewmat
+
+
+Rigs = Iterator[tuple[int, list[tuple[tuple[int, int], np.ndarray]]]]
+"""Each rig's identifier, and its sensors (kind, identifier) but the reference one, with their poses [7] in the rig."""
+Frames = Iterator[tuple[int, int, np.ndarray, list[tuple[int, int, int]]]]
+"""Each frame's identifier, its rig's, its pose [7], and (kind of sensor, sensor, image) of what was taken."""
+
+
+def _binary_rigs(path: Path) -> Rigs:
+    file = _Binary(path)
+    for _ in file.records(8):
+        rig, count = file.unpack("II")
+        sensors = []
+        for position in range(count):
+            sensor = file.unpack("iI")
+            if position and file.unpack("B")[0]:
+                sensors.append((sensor, np.array(file.unpack("7d"))))
+        yield rig, sensors
+
+
+def _binary_frames(path: Path) -> Frames:
+    file = _Binary(path)
+    for _ in file.records(68):
+        frame, rig, *pose, count = file.unpack("II7dI")
+        yield frame, rig, np.array(pose), [file.unpack("iIQ") for _ in range(count)]
+
+
+def _text_rigs(path: Path) -> Rigs:
+    for line, words in _text_records(path):
+        sensors, rest, count = [], words[4:], 1
+        try:
+            _ = SENSORS.index(words[2]), int(words[3])  # the reference sensor, which is in the middle of the rig
+            while rest:
+                if int(rest[2]):
+                    sensors.append(((SENSORS.index(rest[0]), int(rest[1])), np.array(rest[3:10], np.float64)))
+                    if sensors[-1][1].shape != (7,):
+                        raise ValueError
+                rest, count = rest[10 if int(rest[2]) else 3 :], count + 1
+            if count != int(words[1]):
+                raise ValueError
+            yield int(words[0]), sensors
+        except (ValueError, IndexError):
+            raise _line_damaged(path, line, "a rig: identifier, count of sensors, and the sensors") from None
+
+
+def _text_frames(path: Path) -> Frames:
+    for line, words in _text_records(path):
+        try:
+            members = [
+                (SENSORS.index(words[at]), int(words[at + 1]), int(words[at + 2])) for at in range(10, len(words), 3)
+            ]
+            pose = np.array(words[2:9], np.float64)
+            if pose.shape != (7,):
+                raise ValueError
+            yield int(words[0]), int(words[1]), pose, members
+        except (ValueError, IndexError):
+            raise _line_damaged(path, line, "a frame: identifier, rig, rotation, translation and images") from None
 
 
 def _damaged(path: Path, trouble: str) -> InputError:
@@ -184,7 +287,7 @@ def _binary_images(path: Path) -> Iterator[ModelImage]:
         name = file.name()
         count = file.count(FEATURE.itemsize)
         features = np.frombuffer(file.data, FEATURE, count, file.skip(count * FEATURE.itemsize))
-        yield ModelImage(number, camera, name, np.array(pose[:4]), np.array(pose[4:]), features)
+        yield ModelImage(number, camera, name, np.array(pose), features)
 
 
 def _binary_points(path: Path) -> np.ndarray:
@@ -248,7 +351,7 @@ def _text_images(path: Path) -> Iterator[ModelImage]:
         except (ValueError, IndexError):
             what = "an image: identifier, rotation (4 numbers), translation (3), camera and name"
             raise _line_damaged(path, line, what) from None
-        yield ModelImage(number, camera, name, pose[:4], pose[4:], _text_features(path, line + 1, features))
+        yield ModelImage(number, camera, name, pose, _text_features(path, line + 1, features))
 
 
 def _text_features(path: Path, line: int, text: str) -> np.ndarray:

@@ -147,7 +147,8 @@ def _placed(keep: np.ndarray, lens: Lens | None, target: tuple[int, int]) -> np.
     """[H, W] bool: the mask after what is done to its photo."""
     if lens is not None:
         image = np.where(keep, np.uint8(255), np.uint8(0))[:, :, None]
-        keep = np.asarray(lens.undistort(image, lens.size_of((keep.shape[1], keep.shape[0])))[:, :, 0] == 255)
+        undistorted = lens.undistort(image, lens.size_of((keep.shape[1], keep.shape[0])))
+        return _reduced(np.asarray(undistorted[:, :, 0] == 255), target)
     return _reduced(keep, target)
 
 
