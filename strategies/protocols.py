@@ -13,7 +13,7 @@ import numpy as np
 from torch import Tensor
 
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.rules import UpdateRule
+from turbogs_plugin.engine.rules import LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.types import (
     Cameras,
@@ -53,15 +53,20 @@ class ViewSampler(Protocol):
 
 @runtime_checkable
 class PixelSampler(Protocol):
-    """Which pixels of the chosen views are rendered (section 3.5)."""
+    """Which pixels of the chosen views are rendered (section 3.5).
+
+    Attributes:
+        heeds_masks: `sample` draws no masked pixel, so that the trainer need not take any out.
+    """
+
+    heeds_masks: bool = False
 
     def sample(self, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
         """Draw the samples of an iteration from the maps of these views, on the maps' device.
 
         They are of these views, in this order: give `view_ids` to `PixelSamples`, or to its `from_mask` and
         `from_coordinates`. ``maps.masks`` says which pixels count. A trainer takes masked ones out of the result
-        (`PixelMasks.strip`), unless the sampler has an attribute ``heeds_masks`` that is True: then it must have drawn
-        none.
+        (`PixelMasks.strip`), unless `heeds_masks`.
         """
 
 
@@ -69,9 +74,12 @@ class PixelSampler(Protocol):
 class SparseLoss(Protocol):
     """A loss on sampled pixels with its own gradient (section 3.7).
 
-    One with an attribute ``terms``, a `LossTerms`, is a rule: an engine evaluates it and updates the error maps in one
-    step. Else `__call__` is used, and the maps get its `pixel_errors`.
+    Attributes:
+        terms: the loss as a rule: an engine evaluates it and updates the error maps in one step. None: `__call__` is
+            used, and the maps get its `pixel_errors`.
     """
+
+    terms: LossTerms | None = None
 
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
         """The loss, its gradient by each colour, and the error of each pixel (`LossOutput`).

@@ -125,15 +125,20 @@ def build(kind: str, mapping: Mapping[str, Any]) -> Any:
     if not isinstance(mapping, Mapping):
         raise InputError(f"{kind}: expected a mapping with a 'type', got {mapping!r}")
     options = dict(mapping)
-    name = options.pop("type", default_type(kind))
-    strategy = build_dataclass(strategy_class(kind, name), options, kind)
+    chosen = options.pop("type", default_type(kind))
+    strategy = build_dataclass(strategy_class(kind, chosen), options, kind)
     # An attribute is there, or will be as a field of run-time state. Nothing is read: that may need `setup`.
     present = {*dir(strategy), *(field.name for field in fields(strategy))}
-    members = (name for name in vars(PROTOCOLS[kind]) if not name.startswith("_") or name == "__call__")
-    missing = [name for name in members if name not in present]
+    members = {name: value for name, value in vars(PROTOCOLS[kind]).items() if name[0] != "_" or name == "__call__"}
+    missing = []
+    for name, default in members.items():
+        if name not in present and not callable(default) and not isinstance(default, property):
+            object.__setattr__(strategy, name, default)  # of a class that does not inherit from the protocol
+        elif name not in present:
+            missing.append(name)
     if missing:
         raise InputError(
-            f"{kind}.type '{name}' ({known_types(kind).get(name, name)}) is no {PROTOCOLS[kind].__name__}: "
+            f"{kind}.type '{chosen}' ({known_types(kind).get(chosen, chosen)}) is no {PROTOCOLS[kind].__name__}: "
             f"it lacks {', '.join(missing)}"
         )
     return strategy

@@ -213,7 +213,7 @@ class _Trial:
 
     def __init__(self, config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE) -> None:
         self._config, self._ranks = caps.without_growth(config), ranks
-        self._trainer = Trainer(self._config, scene, device, ranks=ranks)
+        self._trainer = Trainer(self._config, scene, device, engine=ranks.engine(device))
         self._model = self._trainer.gaussians.map(torch.clone)  # the trainer may place the next one over it
         self._device = device
         self.gaussians = len(self._model)
@@ -239,13 +239,12 @@ class _Trial:
     def _timed(self, stride: int, seconds: float) -> tuple[int, float]:
         """(Gaussians, seconds of an iteration) with every `stride`-th of the initial model."""
         trainer, train = self._trainer, self._config.train
-        trainer.gaussians = self._model.map(lambda value: value[::stride].clone())
-        trainer.optimizer.setup(trainer.gaussians)
+        trainer.begin_with(self._model.map(lambda value: value[::stride].clone()))
         # About half way, a schedule's views and rates are near their means.
         trainer.iteration = max(train.sh_degree * train.sh_interval, train.iterations // 2)
-        TrainingLoop(trainer).advance(trainer.iteration + WARMUP_ITERATIONS[self._device.type])
+        TrainingLoop(trainer, ranks=self._ranks).advance(trainer.iteration + WARMUP_ITERATIONS[self._device.type])
         enough = _Enough(FEWEST_MEASURED[self._device.type], seconds)
-        loop = TrainingLoop(trainer, listeners=[enough])
+        loop = TrainingLoop(trainer, listeners=[enough], ranks=self._ranks)
         loop.advance(sys.maxsize)
         return len(trainer.gaussians), loop.clock.seconds / enough.iterations
 

@@ -30,7 +30,7 @@ class IterationPace:
     """
 
     def __init__(self, train: TrainConfig) -> None:
-        self.iterations = train.iterations
+        self.iterations = int(train.iterations)
         self.refine_until = train.refine_until
         self._evaluations = train.evaluation_iterations()
         self._save_every = train.checkpoint_every or self.iterations
@@ -70,7 +70,7 @@ class TimePace:
     """
 
     def __init__(self, train: TrainConfig, seconds: float, cost: IterationCost | None = None, cap: int = 0) -> None:
-        self.iterations = train.iterations
+        self.iterations = int(train.iterations)
         self.refine_until = train.refine_until
         self._seconds = seconds
         self._cost = cost or IterationCost(1.0, 0.0)

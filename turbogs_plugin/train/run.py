@@ -77,10 +77,10 @@ def new_loop(
     if device.type == "cuda" and views > MAX_VIEWS:
         raise InputError(f"schedule: {views} views an iteration, and a GPU takes at most {MAX_VIEWS}: ask for fewer")
     config, calibration = within_budget(_agreed(config, ranks), scene, device, ranks)
-    trainer = Trainer(config, scene, device, ranks=ranks)
+    trainer = Trainer(config, scene, device, engine=ranks.engine(device))
     pace = pace_of(config, calibration and calibration.cost)
     seconds = calibration.seconds if calibration else 0.0
-    return TrainingLoop(trainer, pace, seconds=seconds), calibration
+    return TrainingLoop(trainer, pace, seconds=seconds, ranks=ranks), calibration
 
 
 def _agreed(config: Config, ranks: Ranks) -> Config:
@@ -206,7 +206,8 @@ def resume(
         hold_to(limit, device)
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
         resuming = state is not None
-        loop = TrainingLoop(Trainer(config, scene, device, resuming, ranks), pace_of(config))
+        trainer = Trainer(config, scene, device, resuming, ranks.engine(device))
+        loop = TrainingLoop(trainer, pace_of(config), ranks=ranks)
         session = RunSession(folder, plan, scene, loop, clock)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))
