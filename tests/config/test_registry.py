@@ -148,7 +148,7 @@ def test_a_decay_without_an_interval_may_be_scaled(monkeypatch):
 
 def test_all_that_a_class_lacks_is_named(monkeypatch):
     _plug_in(monkeypatch, "half", "third_party_samplers:Half")
-    lacking = "is no DensityController: it lacks watched, stats, event_due, growth_room, apply, "
+    lacking = "is no DensityController: it lacks stats, event_due, growth_room, apply, "
     lacking += "state_dict, load_state_dict"
     with pytest.raises(InputError, match=lacking):
         registry.build("density", {"type": "half"})

@@ -9,18 +9,18 @@ import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_config
 from helpers.simulated_time import SimulatedTime
-from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.distributed.exchange import Exchange
+from turbogs_plugin.distributed.in_place import SharedModel
 from turbogs_plugin.distributed.peer_memory import PeerMemory
-from turbogs_plugin.distributed.shared_model import SharedModel
+from turbogs_plugin.engine.base import BaseEngine
 from turbogs_plugin.plan.caps import EXPECTED_GROWTH, growth_cap, growth_room
 from turbogs_plugin.plan.memory import MemoryDemand
 from turbogs_plugin.plan.pixels import TOLERANCE, pixel_budget_range, pixels_for_time, with_pixel_budget
 from turbogs_plugin.plan.time import IterationCost
 from turbogs_plugin.report.pages import write_report
 from turbogs_plugin.scene import Scene, load_scene
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.train import calibration, run
 
 CPU = torch.device("cpu")
@@ -223,7 +223,7 @@ def test_half_the_model_and_all_of_it_are_of_one_model(scene, monkeypatch):
     """Also where a trainer places one model over the other, as several processes that share memory do."""
     ranks = SimpleNamespace(rank=0, count=2)
     shared = SharedModel(ranks, lambda ranks, size, device: PeerMemory([torch.zeros(size) for _ in range(2)], print))
-    monkeypatch.setattr(Exchange, "place", lambda exchange, gaussians: shared.place(gaussians))
+    monkeypatch.setattr(BaseEngine, "place", lambda engine, gaussians: shared.place(gaussians))
     trial = calibration._Trial(tiny_config(Path("capture")).without_plan(), scene, CPU)
     first = trial._model.map(torch.clone)
     with torch.no_grad():

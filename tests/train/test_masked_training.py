@@ -10,6 +10,7 @@ import torch
 from helpers.framework_runs import assert_identical, tiny_capture, tiny_config
 from PIL import Image
 from turbogs_plugin.strategies.losses import CharbonnierLoss
+from turbogs_plugin.strategies.protocols import PixelSampler
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
@@ -64,7 +65,7 @@ def with_other_masked_pixels(scene):
     return replace(scene, train=replace(views, photos=Photos(colors, views.photos.sizes)))
 
 
-class ForeignSampler:
+class ForeignSampler(PixelSampler):
     """Every fifth pixel of the views, masked or not."""
 
     def sample(self, maps, view_ids, rate, step):
