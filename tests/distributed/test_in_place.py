@@ -15,16 +15,16 @@ from helpers.processes import ended, grouped, said, start_ranks
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import Config, load_config
-from turbogs_plugin.distributed import in_place, peer_memory, shared_model
-from turbogs_plugin.distributed.in_place import DRAWN, FREE, STEPPED, WRITTEN, InPlace
+from turbogs_plugin.distributed import in_place, peer_memory, ranks_engine
+from turbogs_plugin.distributed.in_place import DRAWN, STEPPED, WRITTEN, SharedModel
 from turbogs_plugin.distributed.peer_memory import PeerMemory, aligned_starts, share_memory
 from turbogs_plugin.distributed.ranks import ProcessRanks
+from turbogs_plugin.distributed.ranks_engine import RanksEngine
 from turbogs_plugin.distributed.rows import rows_of
-from turbogs_plugin.distributed.shared_model import SharedModel
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.protocol import ModelCopies
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.rendered import ScreenRecords
+from turbogs_plugin.engine.shared import ModelCopies, SharedEngine
 from turbogs_plugin.model.torch_file import leaves
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
@@ -32,17 +32,15 @@ from turbogs_plugin.train.trainer import Trainer
 CPU = torch.device("cpu")
 
 CASES = {
-    "usual": (True, ()),
-    "records to all": (False, ()),
-    "one view": (True, ("schedule.type=fixed", "schedule.views=1")),
-    "one view to all": (False, ("schedule.type=fixed", "schedule.views=1")),
-    "one tile": (True, ("schedule.type=fixed", "schedule.views=1", "schedule.pixel_budget=0.1")),
-    "no rule": (False, ("optimizer.type=adam",)),
+    "usual": (),
+    "one view": ("schedule.type=fixed", "schedule.views=1"),
+    "one tile": ("schedule.type=fixed", "schedule.views=1", "schedule.pixel_budget=0.1", "pixel_sampler.unit=tile"),
+    "no rule": ("optimizer.type=adam",),
 }
-"""Name -> (whether rows have owners, overrides). The fourth iteration has an event of density control, where it is on.
-With one tile all processes but one have no samples."""
+"""Name -> overrides. The fourth iteration has an event of density control, where it is on. With one tile all processes
+but one have no samples; without a rule all get all records."""
 
-OF_THREE = ("usual", "records to all", "one tile")
+OF_THREE = ("usual", "one tile")
 """With three processes these are enough: some views are shared by all."""
 
 STEPS = 5
@@ -50,31 +48,26 @@ STEPS = 5
 FIRST_ERRORS: dict[tuple[int, int], torch.Tensor] = {}
 """(Gaussians, view) -> errors before the first step, which are the same in all cases."""
 
-
 scene_of = cache(load_scene)  # a trainer only reads it
 
 
 @cache
 def config_of(capture: Path, overrides: tuple[str, ...]) -> Config:
-    settings = tiny_settings(*overrides)
-    if "schedule.pixel_budget=0.1" in overrides:
-        settings.append("pixel_sampler.unit=tile")
-    config = load_config("turbogs", [*settings, "train.device=cpu", *overrides])
+    config = load_config("turbogs", [*tiny_settings(*overrides), "train.device=cpu", *overrides])
     config.scene.path = str(capture)
     return config.without_plan()
 
 
-def trainer_of(capture: Path, ranks: ProcessRanks, by_rows: bool, overrides: tuple[str, ...]) -> Trainer:
-    trainer = Trainer(copy.deepcopy(config_of(capture, overrides)), scene_of(capture), CPU, ranks=ranks)
-    trainer.exchange.by_rows = by_rows
-    return trainer
-
-
-def initialise_maps(trainer: Trainer) -> None:
-    """Every trainer exchanges the errors of its model, which are those of the first one: that alone renders them."""
+def trainer_of(
+    capture: Path, ranks: ProcessRanks, files: PeerFiles, *overrides: str, engine: SharedEngine | None = None
+) -> Trainer:
+    """With memory of these files, and an engine that keeps passes there."""
+    engine = RanksEngine(engine or KeepingEngine(), ranks, CPU, files)
+    trainer = Trainer(copy.deepcopy(config_of(capture, overrides)), scene_of(capture), CPU, engine=engine)
     render, count = trainer.dense_errors, len(trainer.gaussians)
 
     def errors(view: int) -> torch.Tensor:
+        """The first trainer alone renders them."""
         if (count, view) not in FIRST_ERRORS:
             FIRST_ERRORS[count, view] = render(view)
         return FIRST_ERRORS[count, view].clone()
@@ -82,19 +75,19 @@ def initialise_maps(trainer: Trainer) -> None:
     trainer.dense_errors = errors
     trainer.initialise_maps()
     del trainer.dense_errors
+    return trainer
 
 
-def run(trainer: Trainer, ways: list[bool]) -> dict:
+def run(trainer: Trainer, ways: list[bool], possible: bool = True) -> dict:
     """The state after a step for each of these, which say whether in place, with an evaluation in the middle."""
-    initialise_maps(trainer)
     for number, way in enumerate(ways):
-        trainer.exchange.in_place = way
+        trainer.engine.in_place = way
         trainer.step()
-        assert trainer.exchange.way == ("in place" if way else "messages")
+        assert trainer.engine.way == ("in place" if way and possible else "messages")
         if number == len(ways) // 2:
             trainer.dense_errors(0)
-            trainer.compare_replicas()
-    trainer.compare_replicas()
+            trainer.complete()
+    trainer.complete()
     return copy.deepcopy(dict(leaves(trainer.state_dict(), "state")))
 
 
@@ -107,87 +100,53 @@ def same(first: dict, second: dict) -> None:
 
 def every_case(capture: Path, folder: Path) -> None:
     """In every process: each case by messages and in place; the memory grows by an event of density control."""
-    ranks = grouped()
-    in_place.LEAST = shared_model.LEAST = 0  # these memories are files
+    ranks, wanted = grouped(), {}
+    ranks_engine.OWNERS_FROM = in_place.LEAST = 0  # rows have owners in messages, too; these memories are files
     for name in CASES if ranks.count == 2 else OF_THREE:
-        by_rows, overrides = CASES[name]
-        wanted = run(trainer_of(capture, ranks, by_rows, overrides), [False] * STEPS)
+        trainer = trainer_of(capture, ranks, PeerFiles(folder / f"{name}-messages"), *CASES[name])
+        wanted[name] = run(trainer, [False] * STEPS)
         for engine in (ReferenceEngine(), KeepingEngine()):
             memory = PeerFiles(folder / f"{name}-{type(engine).__name__}")
-            trainer = keeping(trainer_of(capture, ranks, by_rows, overrides), memory)
-            trainer.engine, number = engine, len(trainer.gaussians)
-            same(run(trainer, [True] * STEPS), wanted)
+            trainer = trainer_of(capture, ranks, memory, *CASES[name], engine=engine)
+            number = len(trainer.gaussians)
+            same(run(trainer, [True] * STEPS), wanted[name])
             assert len(trainer.gaussians) != number
-            grown = len(memory.sizes) - 1  # the first one is reserved before training
-            others = [STEPPED] * STEPS if by_rows else [FREE] * (STEPS - grown)
-            assert sorted(memory.barriers) == sorted([WRITTEN, DRAWN] * STEPS + others)
-    wanted = run(trainer_of(capture, ranks, True, ()), [False] * STEPS)
+            assert memory.barriers == [WRITTEN, DRAWN, STEPPED] * STEPS
     turns, files = [True, False, True, False, True], PeerFiles(folder / "turns")
-    same(run(keeping(trainer_of(capture, ranks, True, ()), files), turns), wanted)
+    same(run(trainer_of(capture, ranks, files), turns), wanted["usual"])
     assert files.barriers.count(STEPPED) == sum(turns)
-    without_some_memory(capture, ranks, folder, wanted)
-    reserved(capture, ranks, folder)
-    growing(capture, ranks, folder, wanted)
+    without_some_memory(capture, ranks, folder, wanted["usual"])
+    growing(capture, ranks, folder, wanted["usual"])
     few(capture, ranks, folder)
-    for by_rows in (True, False):
-        lost(capture, ranks, folder / f"lost-{by_rows}", by_rows)
-
-
-def keeping(trainer: Trainer, files: PeerFiles, models: int | None = None) -> Trainer:
-    """With memory of these files, and of others for the model.
-
-    Args:
-        models: memories for models that can be had; None: as many as wanted.
-    """
-    trainer.engine, trainer.exchange.memory = KeepingEngine(), InPlace(trainer.ranks, files)
-    files.of_model = PeerFiles(files.folder / "model", most=models)
-    trainer.exchange.model = SharedModel(trainer.ranks, files.of_model)
-    trainer.gaussians = trainer.gaussians
-    return trainer
+    lost(capture, ranks, folder)
 
 
 def without_some_memory(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> None:
     """Where there is no memory for the model, parameters go by messages; where there is none for passes, all does.
-    Nobody asks again."""
-    files = PeerFiles(folder / "of passes")
-    trainer = keeping(trainer_of(capture, ranks, True, ()), files, models=0)
-    same(run(trainer, [True] * STEPS), wanted)
-    assert files.barriers == [WRITTEN, DRAWN] * STEPS and files.of_model.refused == 1
-    files = PeerFiles(folder / "none", most=0)
-    trainer = keeping(trainer_of(capture, ranks, True, ()), files)
-    initialise_maps(trainer)
-    for _ in range(STEPS):
-        trainer.step()
-        assert trainer.exchange.way == "messages"
-    trainer.compare_replicas()
-    same(dict(leaves(trainer.state_dict(), "state")), wanted)
-    assert files.refused == 1 and not files.barriers
-
-
-def reserved(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
-    """Memory that was taken before training and suffices is never replaced."""
-    wanted = run(trainer_of(capture, ranks, False, ()), [False] * STEPS)
+    Nobody asks again. Memory that was taken before training and suffices is never replaced."""
     in_place.LEAST = 1 << 18
-    files = PeerFiles(folder / "reserved")
-    same(run(keeping(trainer_of(capture, ranks, False, ()), files), [True] * STEPS), wanted)
-    assert len(files.sizes) == 1
-    assert sorted(files.barriers) == sorted([WRITTEN, DRAWN] * STEPS + [FREE] * (STEPS - 1))
+    files = PeerFiles(folder / "of passes", most=1)
+    same(run(trainer_of(capture, ranks, files), [True] * STEPS), wanted)
+    assert files.barriers == [WRITTEN, DRAWN] * STEPS and files.refused == 1
     in_place.LEAST = 0
+    files = PeerFiles(folder / "none", most=0)
+    same(run(trainer_of(capture, ranks, files), [True] * STEPS, possible=False), wanted)
+    assert files.refused == 2 and not files.barriers
 
 
 def growing(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> None:
     """Without room to spare, the event before the last iteration makes the memory of the model grow."""
     before = in_place.with_room
-    in_place.with_room = shared_model.with_room = lambda numbers, *least: numbers
+    in_place.with_room = lambda numbers, *least: numbers
     files = PeerFiles(folder / "growing")
-    trainer = keeping(trainer_of(capture, ranks, True, ()), files)
+    trainer = trainer_of(capture, ranks, files)
     counts = [len(trainer.gaussians)]
     same(run(trainer, [True] * STEPS), wanted)
     counts.append(len(trainer.gaussians))
     widths = [value[0].numel() for _, value in trainer.gaussians.items()]
     sizes = [aligned_starts([count * width for width in widths])[-1] for count in counts]
-    assert files.of_model.sizes == sizes and sizes[0] < sizes[1]
-    in_place.with_room = shared_model.with_room = before
+    assert sizes[0] < sizes[1] and set(sizes) <= set(files.sizes)
+    in_place.with_room = before
 
 
 def few(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
@@ -196,28 +155,25 @@ def few(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
     assert rows_of(count, ranks.count)[-1] == slice(count, count)
     for way in (False, True):
         files = PeerFiles(folder / f"few-{way}")
-        trainer = keeping(trainer_of(capture, ranks, True, ("density.type=none",)), files)
+        trainer = trainer_of(capture, ranks, files, "density.type=none")
         first = trainer.gaussians.map(torch.clone)
-        trainer.gaussians = first.map(lambda value: value[:count].clone())
-        trainer.optimizer.setup(trainer.gaussians)
-        trainer.density.setup(trainer.gaussians)
+        trainer.begin_with(first.map(lambda value: value[:count].clone()))
         states.append(run(trainer, [way] * STEPS))
         assert not torch.equal(trainer.gaussians.means, first.means[:count])
         assert files.barriers.count(STEPPED) == way * STEPS
     same(*states)
 
 
-def lost(capture: Path, ranks: ProcessRanks, folder: Path, by_rows: bool) -> None:
+def lost(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
     """One process has too little memory for one pass: all repeat it, and nothing of it stays."""
     states = []
     for way in (False, True):
-        trainer = keeping(trainer_of(capture, ranks, by_rows, ("density.type=none",)), PeerFiles(folder / str(way)))
-        trainer.engine = KeepingEngine(lose=2 if ranks.rank == ranks.count - 1 else None)
-        trainer.exchange.in_place = way
-        initialise_maps(trainer)
+        engine = KeepingEngine(lose=2 if ranks.rank == ranks.count - 1 else None)
+        trainer = trainer_of(capture, ranks, PeerFiles(folder / f"lost-{way}"), "density.type=none", engine=engine)
+        trainer.engine.in_place = way
         TrainingLoop(trainer).advance(6)
-        trainer.compare_replicas()
-        assert trainer.engine.recovered == 1 and int(trainer.optimizer.moments.steps.max()) == 6
+        trainer.complete()
+        assert engine.recovered == 1 and int(trainer.optimizer.moments.steps.max()) == 6
         states.append(copy.deepcopy(dict(leaves(trainer.state_dict(), "state"))))
     same(*states)
 

@@ -23,13 +23,6 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="by a call of Li
 
 SECONDS = 60.0
 """Far more than anything here takes."""
-ABLATION = """
-title: Endless
-base: turbogs
-baseline: full
-variants:
-  full: []
-"""
 
 
 def state(process: int) -> tuple[str, int]:
@@ -82,14 +75,6 @@ def test_processes_of_a_training_end_with_their_launcher(capture, tmp_path):
     newest = latest_checkpoint(checkpoints)
     iteration = load_checkpoint(newest)["trainer"]["iteration"]
     assert iteration >= 3 and newest.name == f"iteration-{iteration:06d}.pt"
-
-
-def test_processes_of_a_study_end_with_their_launcher(capture, tmp_path):
-    (tmp_path / "endless.yaml").write_text(ABLATION)
-    words = ["ablate", str(tmp_path / "endless.yaml"), "--scene", str(capture), "--out", str(tmp_path / "study")]
-    words += ["--seeds", "0", "1", "--gpus", "0,1", "--device", "cpu", "--steps", "1000000"]
-    claims = tmp_path / "study/claims"
-    assert not left_after_its_kill(words, tmp_path, lambda: sum(path.is_file() for path in claims.rglob("*")) == 2)
 
 
 def joining(launcher: str, tells: Connection) -> None:

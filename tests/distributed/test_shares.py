@@ -12,7 +12,6 @@ from turbogs_plugin.distributed.shares import NEARLY, shares_of
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
-from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import PixelSamples, Step
 
 EQUAL = [(160, 96)] * 6
@@ -67,12 +66,6 @@ def test_shares_are_nearly_even(views, count):
     assert max(abs(size - even) for size in sizes) <= 2 * (NEARLY * even + tile)
 
 
-def test_views_that_divide_are_not_cut():
-    shares = shares_of(samples_of(EQUAL, 6), 3)
-    assert [share.views for share in shares] == [slice(0, 2), slice(2, 4), slice(4, 6)]
-    assert not any(share.continues for share in shares)
-
-
 def test_a_view_of_several_shares_begins_in_the_first():
     shares = shares_of(samples_of(EQUAL, 3), 2)
     assert [share.views for share in shares] == [slice(0, 2), slice(1, 3)]
@@ -96,17 +89,6 @@ def test_a_view_without_samples_is_begun_once(empty, count):
     assert sum(share.num_slots for share in shares) == len(samples)
 
 
-def assert_ends_are_known(samples: PixelSamples) -> None:
-    """On the host, as the samples themselves say them."""
-    known = samples.host_ends()
-    for given, asked in zip(known, replace(samples, host_ends=None).ends(), strict=True):
-        np.testing.assert_array_equal(given, asked)
-
-
-def test_dense_samples_know_their_ends():
-    assert_ends_are_known(dense_pixels((0, 1, 2), np.array(MIXED[:3]), "cpu"))
-
-
 @pytest.mark.parametrize("unit", ["pixel", "tile"])
 @pytest.mark.parametrize("rate", [0.004, 0.3, 1.0])
 @pytest.mark.parametrize("masked", [False, True])
@@ -114,6 +96,7 @@ def test_draws_know_their_ends(unit, rate, masked):
     """Where masks leave some tiles alone, too: so no process waits for its device to share the samples out."""
     masks = half_masked(MIXED) if masked else None
     samples = samples_of(MIXED, 5, unit, rate, masks)
-    assert_ends_are_known(samples)
+    for given, asked in zip(samples.host_ends(), replace(samples, host_ends=None).ends(), strict=True):
+        np.testing.assert_array_equal(given, asked)
     assert samples.host_ends == samples_of(MIXED, 5, unit, rate, masks).host_ends, "shares are kept by them"
     assert (len(samples.tile_ids) < len(samples_of(MIXED, 5, unit, rate).tile_ids)) == masked

@@ -14,9 +14,9 @@ from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda.engine import CudaEngine
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
-from turbogs_plugin.engine.protocol import Engine, PassMemory
 from turbogs_plugin.engine.reference.records import collect_records, gather_colors
 from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, ScreenRecords
+from turbogs_plugin.engine.shared import PassMemory, SharedEngine
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 pytestmark = GPU_ONLY
@@ -116,7 +116,9 @@ class OneOfTwo:
         self.rank = rank
 
 
-def in_place_like_twin(engines: list[Engine], gaussians: Gaussians, cameras: Cameras, samples: PixelSamples) -> int:
+def in_place_like_twin(
+    engines: list[SharedEngine], gaussians: Gaussians, cameras: Cameras, samples: PixelSamples
+) -> int:
     """Two shares of a batch in one process, one after the other, so that barriers have nothing to do.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Several processes on GPUs: the seam of engine and exchange on one, and whole runs over NCCL where there are two."""
+"""Several processes on GPUs: the seam of the engines on one, and whole runs over NCCL where there are two."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from PIL import Image
 from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.captures import write_demo_capture
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.distributed.digest import digest
 from turbogs_plugin.distributed.processes import start
+from turbogs_plugin.distributed.replicas import digest
 from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.rendered import RenderOptions, ScreenRecords
@@ -148,7 +148,7 @@ def with_helpers(monkeypatch) -> None:
 
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
 def test_what_two_gpus_read_in_place_is_what_messages_bring(tmp_path: Path, with_helpers):
-    """To the bit, in both modes, with fewer views than processes, density control and an overflow."""
+    """To the bit, with fewer views than processes, density control and an overflow."""
     capture = write_demo_capture(tmp_path / "capture", views=12, width=160, height=120)
     assert start(2, ["compared", str(capture)], "cuda", "helpers.in_place_case") == 0
 

@@ -1,39 +1,34 @@
 """What each process of a test on several GPUs does: steps with the exchange in place, which keep what was read of the
-others, to be compared with what messages give of the same. Two runs of one way differ by the order of sums on a GPU."""
+others, to be compared with what messages give of it. Two runs of one way differ by the order of sums on a GPU."""
 
 from __future__ import annotations
 
 import signal
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from os import getpid, kill
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.distributed.exchange import RankExchange
 from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.processes import joined
-from turbogs_plugin.distributed.ranks import Ranks
-from turbogs_plugin.distributed.rows import Packing, RowGather
+from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
+from turbogs_plugin.distributed.ranks_engine import RanksEngine
+from turbogs_plugin.distributed.rows import RowGather
 from turbogs_plugin.distributed.shared_pass import SharedScreen
 from turbogs_plugin.engine.cuda import workspace
-from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.rendered import ScreenRecords
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import Gaussians
 
-CASES = {
-    "owners": (True, ("schedule.min_views=3", "schedule.max_views=5")),
-    "all": (False, ("schedule.min_views=3", "schedule.max_views=5")),
-    "one view, owners": (True, ("schedule.min_views=1", "schedule.max_views=1")),
-    "one view, all": (False, ("schedule.min_views=1", "schedule.max_views=1")),
-}
+CASES = {"several views": (3, 5), "one view": (1, 1)}
+"""Name -> the fewest and the most views of an iteration."""
 STEPS = 60
 
 
@@ -45,36 +40,41 @@ class Kept:
         self.screens: list[tuple] = []
         self.parameters: list[tuple] = []
         self.arrived_in_place = 0
-        colors, of_rows, update = InPlace.colors, SharedScreen.of_rows, RankExchange.update
+        self._before = {(InPlace, "colors"): self.kept_colors, (SharedScreen, "of_rows"): self.kept_rows}
+        self._before[RanksEngine, "update"] = self.kept_update
+        for (owner, name), kept in self._before.items():
+            self._before[owner, name] = method = getattr(owner, name)
+            setattr(owner, name, self.around(method, kept))
 
-        def kept_colors(memory: InPlace, engine: Engine, shares: list, own: Tensor | None, *flags: object) -> Tensor:
-            found = colors(memory, engine, shares, own, *flags)
-            # The next pass overwrites what this one has rendered and gathered.
-            self.colors.append((shares, None if own is None else own.clone(), found.clone()))
-            return found
+    def around(self, method: Callable, kept: Callable) -> Callable:
+        return lambda *arguments: kept(method, *arguments)
 
-        def kept_rows(screen: SharedScreen, rows: list, own) -> object:
-            found, plain = of_rows(screen, rows, own), screen._plain
-            if plain is not None:
-                plain = ScreenRecords(plain.records.clone(), plain.radii.clone(), plain.with_statistics)
-            # The step leaves nothing of use in the records.
-            self.screens.append((replace(screen, _plain=plain), rows, found.records.clone(), found.radii.clone()))
-            return found
+    def kept_colors(self, colors: Callable, memory: InPlace, engine: Any, shares: list, own: Any, *flags: Any) -> Any:
+        found = colors(memory, engine, shares, own, *flags)
+        # The next pass overwrites what this one has rendered and gathered.
+        self.colors.append((shares, None if own is None else own.clone(), found.clone()))
+        return found
 
-        def kept_update(exchange: RankExchange, engine: Engine, rule, screen, gaussians: Gaussians, *states) -> None:
-            update(exchange, engine, rule, screen, gaussians, *states)
-            if not exchange._incomplete:  # all processes made all steps
-                return
-            exchange.finish()
-            owned = exchange._owned
-            self.arrived_in_place += exchange.way == "in place" and owned.copies is not None
-            self.parameters.append((owned.rows, owned.gaussians.map(torch.clone), gaussians.map(torch.clone)))
+    def kept_rows(self, of_rows: Callable, screen: SharedScreen, rows: list, own: Any) -> Any:
+        found, plain = of_rows(screen, rows, own), screen._plain
+        if plain is not None:
+            plain = ScreenRecords(plain.records.clone(), plain.radii.clone(), plain.with_statistics)
+        # The step leaves nothing of use in the records.
+        self.screens.append((replace(screen, _plain=plain), rows, found.records.clone(), found.radii.clone()))
+        return found
 
-        self._before = colors, of_rows, update
-        InPlace.colors, SharedScreen.of_rows, RankExchange.update = kept_colors, kept_rows, kept_update
+    def kept_update(
+        self, update: Callable, engine: RanksEngine, rule: Any, screen: Any, model: Any, *more: Any
+    ) -> None:
+        update(engine, rule, screen, model, *more)
+        owned = engine._owned
+        if owned is not None:  # else all processes made all steps
+            self.arrived_in_place += engine.way == "in place" and owned.copies is not None
+            self.parameters.append((owned.rows, owned.gaussians.map(torch.clone), model.map(torch.clone)))
 
-    def compare(self) -> None:
-        InPlace.colors, SharedScreen.of_rows, RankExchange.update = self._before
+    def compare(self, ranks: ProcessRanks) -> None:
+        for (owner, name), method in self._before.items():
+            setattr(owner, name, method)
         for screen, rows, records, radii in self.screens:
             target = ScreenRecords(torch.empty_like(records), torch.empty_like(radii), False)
             screen._send_and_receive(rows, target)
@@ -82,7 +82,6 @@ class Kept:
             seen = (radii > 0).any(dim=-1)
             # A pass that overflows draws nothing: what lies there may be NaN.
             torch.testing.assert_close(records[seen], target.records[seen], rtol=0, atol=0, equal_nan=True)
-        ranks = self.screens[0][0]._batch.ranks
         for shares, own, found in self.colors:
             counts = [share.num_slots for share in shares]
             sent = found.new_zeros(max(counts), 3)
@@ -95,61 +94,60 @@ class Kept:
             sent = found.map(torch.zeros_like)
             for name, value in sent.items():
                 value[rows[ranks.rank]] = getattr(own, name)
-            gather = RowGather(ranks, Packing([value for _, value in sent.items()], rows))
-            gather.begin()
-            gather.finish()
+            RowGather(ranks, [value for _, value in sent.items()], rows)()
             for name, value in found.items():
                 assert torch.equal(getattr(sent, name), value), name
 
 
-def trainer_of(capture: Path, ranks: Ranks, by_rows: bool, overrides: tuple[str, ...]) -> Trainer:
-    settings = [f"train.iterations={STEPS}", "train.refine_until=50", "density.refine_from=10"]
-    config = load_config("turbogs", [*settings, "density.refine_every=15", "train.device=cuda", *overrides])
+def trainer_of(capture: Path, ranks: Ranks, views: tuple[int, int] = (3, 5)) -> Trainer:
+    settings = [f"train.iterations={STEPS}", "train.refine_until=50", "density.refine_from=10", "train.device=cuda"]
+    settings += ["density.refine_every=15", f"schedule.min_views={views[0]}", f"schedule.max_views={views[1]}"]
+    config = load_config("turbogs", settings)
     config.scene.path = str(capture)
     scene, device = load_scene(capture), torch.device("cuda")
-    trainer = Trainer(config.without_plan(), scene, device, ranks=ranks)
-    trainer.exchange.by_rows = by_rows
+    trainer = Trainer(config.without_plan(), scene, device, engine=ranks.engine(device))
     trainer.initialise_maps()
     return trainer
 
 
 def recoveries(trainer: Trainer) -> list[int]:
     """The iterations at which the engine recovers, as they come."""
-    found, recover = [], trainer.engine.recover
+    found, engine = [], trainer.engine.engine
+    recover = engine.recover
 
     def noted() -> None:
         found.append(trainer.iteration)
         recover()
 
-    trainer.engine.recover = noted
+    engine.recover = noted
     return found
 
 
 def compared(capture: Path, ranks: Ranks) -> None:
     """Every case, with density control, a view rendered densely by one process alone, and an overflow in one."""
     workspace.CAPACITY_STEP = 32  # so that these few intersections can be too many
-    for name, (by_rows, overrides) in CASES.items():
+    for name, views in CASES.items():
         kept = Kept()
-        trainer = trainer_of(capture, ranks, by_rows, overrides)
-        recovered = recoveries(trainer)
+        trainer = trainer_of(capture, ranks, views)
+        recovered, engine = recoveries(trainer), trainer.engine
         count, loop = len(trainer.gaussians), TrainingLoop(trainer)
         loop.advance(20)
-        if trainer.exchange.way != "in place":
+        if engine.way != "in place":
             raise AssertionError("the exchange went by messages: no symmetric memory on this machine?")
-        assert (kept.arrived_in_place > 0) is by_rows
+        assert kept.arrived_in_place > 0
         if ranks.first:
             trainer.dense_errors(0)
-        trainer.exchange.in_place = False  # some iterations by messages between
+        engine.in_place = False  # some iterations by messages between
         loop.advance(24)
-        trainer.exchange.in_place = True
+        engine.in_place = True
         loop.advance(30)
         if ranks.rank == ranks.count - 1:
-            trainer.engine.workspace._intersections_per_tile *= 0.3
+            engine.engine.workspace._intersections_per_tile *= 0.3
         loop.advance(STEPS)
-        trainer.compare_replicas()
+        trainer.complete()
         assert len(trainer.gaussians) != count and trainer.iteration == STEPS
         assert recovered, "no overflow"
-        kept.compare()
+        kept.compare(ranks)
         if ranks.first:
             updates = f"{len(kept.parameters)} updates by owners, {kept.arrived_in_place} in place"
             print(f"{name}: {len(kept.screens)} passes, {updates}; recovered at {recovered}", flush=True)
@@ -157,7 +155,7 @@ def compared(capture: Path, ranks: Ranks) -> None:
 
 def dying(capture: Path, ranks: Ranks, told: Path) -> None:
     """The last process is killed between two iterations; the others wait for it at a barrier of their GPUs."""
-    trainer = trainer_of(capture, ranks, True, ())
+    trainer = trainer_of(capture, ranks)
     for number in range(STEPS):
         trainer.step()
         if number == 20 and ranks.rank == ranks.count - 1:

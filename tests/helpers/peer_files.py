@@ -1,5 +1,5 @@
 """Memory of processes on CPUs that all of them use in place: files that all have mapped. And an engine that keeps what
-passes leave there, as that of a GPU does."""
+passes leave there, as a GPU's engine does."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from torch import Tensor
 from turbogs_plugin.distributed.peer_memory import PeerMemory
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.protocol import PassMemory
 from turbogs_plugin.engine.rendered import ScreenRecords
+from turbogs_plugin.engine.shared import PassMemory
 
 
 class PeerFiles:

@@ -17,7 +17,7 @@ import torch
 import torch.distributed
 
 STORES: list[torch.distributed.TCPStore] = []
-"""Of the latest processes."""
+"""Stores of the latest processes."""
 
 PRELOADED = [
     "torch",

@@ -89,7 +89,7 @@ def test_iterations_before_a_change_of_the_set_are_not_made_again(scene):
 
 @pytest.mark.parametrize("sampler", ["random", "geometry_aware"])
 def test_lost_iterations_are_made_again_with_the_same_views(scene, sampler):
-    """Those that take much memory are lost, so they would be seen less often."""
+    """Views that take much memory are lost; with other views they would be seen less often."""
     views = (f"view_sampler.type={sampler}", "schedule.max_views=2", "schedule.min_views=2")
     trainer = make_trainer(scene, *views, "train.average_last=1")
     trainer.initialise_maps()

@@ -20,6 +20,7 @@ from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.strategies.losses import CharbonnierLoss
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler
+from turbogs_plugin.strategies.protocols import PixelSampler
 from turbogs_plugin.tiles import compact, pixel_table
 from turbogs_plugin.train.look import Background, Look
 from turbogs_plugin.train.metrics import compare, evaluate, render_view, ssim
@@ -63,7 +64,7 @@ def with_other_masked_pixels(scene):
     return replace(scene, train=replace(views, photos=Photos(colors, views.photos.sizes)))
 
 
-class ForeignSampler:
+class ForeignSampler(PixelSampler):
     """Every fifth pixel of the views, masked or not."""
 
     def sample(self, maps, view_ids, rate, step):

@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import TINY, assert_identical, stop_after, tiny_capture, tiny_config, tiny_settings
+from helpers.framework_runs import TINY, assert_identical, stop_after, tiny_config, tiny_settings
 from helpers.processes import PRELOADED, ended
 from PIL import Image
 
@@ -30,6 +29,7 @@ from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.strategies.density import fastgs, gsplat_default
+from turbogs_plugin.strategies.protocols import PixelSampler, SparseLoss
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import read_history
@@ -73,15 +73,6 @@ def test_a_run_leaves_everything_that_it_promises(whole, capture):
         Image.open(folder.path / "report" / name).verify()
     asked = tiny_config(capture)
     assert resolve(parse_yaml(folder.config.read_text(), "config")) == run.plan_run(asked).apply(asked)
-
-
-def test_the_number_of_gaussians_changed_and_every_part_followed(whole):
-    state = saved(whole.folder.path)
-    counts = {evaluation.num_gaussians for evaluation in whole.history}
-    assert len(counts) > 1
-    count = whole.history[-1].num_gaussians
-    assert all(len(value) == count for value in state["gaussians"].values())
-    assert len(state["optimizer"]["steps"]) == count
 
 
 def test_moments_and_statistics_follow_their_gaussians(capture):
@@ -185,12 +176,6 @@ def test_a_run_killed_without_notice_resumes_bit_for_bit(capture, whole, tmp_pat
     assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
 
 
-def test_a_run_outside_the_main_thread_is_the_same(capture, whole, tmp_path):
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(run.train, tiny_config(capture), tmp_path / "run").result()
-    assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
-
-
 def test_sigterm_before_training_ends_the_process_without_a_trace(capture):
     """pycolmap brings a handler that prints one."""
     code = (
@@ -219,11 +204,6 @@ def test_resuming_a_finished_run_changes_nothing_of_it(capture, whole):
     assert run.resume(whole.folder.path).signal is None
     assert_identical(before, saved(whole.folder.path))
     assert whole.folder.history.read_text() == history
-
-
-def test_another_seed_is_another_run(capture, whole, tmp_path):
-    run.train(tiny_config(capture, "train.seed=1"), tmp_path / "other")
-    assert not torch.equal(saved(whole.folder.path)["maps"]["errors"], saved(tmp_path / "other")["maps"]["errors"])
 
 
 def test_a_model_that_is_not_finite_is_never_saved(capture, tmp_path, monkeypatch):
@@ -299,34 +279,6 @@ def test_the_disk_fills_up(capture, tmp_path, monkeypatch):
     assert str(stopped.value).count("iteration-000005") == 1
     monkeypatch.undo()
     assert saved(tmp_path / "run")["iteration"] == 5
-
-
-def test_weights_of_lpips_are_found_from_another_folder(capture, tmp_path, monkeypatch):
-    """And where they are gone, that is said before anything is trained."""
-    (tmp_path / "here").mkdir()
-    (tmp_path / "here" / "w.pth").touch()
-    monkeypatch.setattr("turbogs_plugin.train.perceptual._load_lpips", lambda file, device: None)
-    with monkeypatch.context() as context:
-        context.chdir(tmp_path / "here")
-        stop_after(context, 5)
-        run.train(tiny_config(capture, "report.lpips_weights=w.pth"), tmp_path / "run")
-    monkeypatch.chdir(tmp_path)
-    with monkeypatch.context() as context:
-        stop_after(context, 6)
-        assert run.resume(tmp_path / "run").signal == signal.SIGINT
-    (tmp_path / "here" / "w.pth").unlink()
-    with pytest.raises(InputError, match=r"lpips_weights: no such file '.*here/w\.pth'"):
-        run.resume(tmp_path / "run")
-    assert saved(tmp_path / "run")["iteration"] == 6
-
-
-def test_a_checkpoint_of_another_capture_is_refused(capture, whole, tmp_path):
-    other = tiny_capture(tmp_path)
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "config.yaml").write_text(tiny_config(other, "scene.factor=2").without_plan().to_yaml())
-    (tmp_path / "run" / "checkpoints").symlink_to(whole.folder.checkpoints)
-    with pytest.raises(InputError, match="has other sizes of train images than when the run"):
-        run.resume(tmp_path / "run")
 
 
 @pytest.fixture
@@ -418,15 +370,6 @@ def test_what_stands_before_a_camera_goes_with_the_next_change(capture, clears, 
     assert len(trainer.optimizer.moments) == len(trainer.density.stats.grad_sums) == len(trainer.gaussians)
 
 
-def test_the_trainer_names_no_strategy():
-    from turbogs_plugin.strategies import TYPES
-    from turbogs_plugin.train import trainer
-
-    source = Path(trainer.__file__).read_text()
-    classes = [place.partition(":")[2] for kind in TYPES.values() for place in kind.values()]
-    assert not [name for name in classes if name in source]
-
-
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -471,26 +414,26 @@ def test_wrong_input_that_is_found_while_training_names_the_last_good_checkpoint
         run.train(tiny_config(capture, "train.checkpoint_every=7"), tmp_path / "run")
 
 
-class OwnSampler:
+class OwnSampler(PixelSampler):
     """A sampler that forgets which views it was asked for."""
 
     def sample(self, maps, view_ids, rate, step):
         return PixelSamples.from_mask(torch.ones(len(view_ids), 40, 48, dtype=torch.bool))
 
 
-class TensorSampler:
+class TensorSampler(PixelSampler):
     def sample(self, maps, view_ids, rate, step):
         return torch.zeros(3, 2)
 
 
-class OwnLoss:
+class OwnLoss(SparseLoss):
     """A loss whose error of a pixel has three numbers."""
 
     def __call__(self, colors, targets, samples):
         return LossOutput((colors - targets).square().mean(), colors - targets, (colors - targets).abs())
 
 
-class ScalarLoss:
+class ScalarLoss(SparseLoss):
     def __call__(self, colors, targets, samples):
         return 0.5
 

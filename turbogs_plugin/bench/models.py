@@ -59,10 +59,8 @@ def trained_model(
 
 def trainer_of(config: Config, scene: Scene, gaussians: Gaussians, device: torch.device, ranks: Ranks = ONE) -> Trainer:
     """A trainer that starts from a copy of these Gaussians, and not from the points of the scene."""
-    trainer = Trainer(config, scene, device, ranks=ranks)
-    trainer.gaussians = gaussians.map(lambda value: value.clone())
-    trainer.optimizer.setup(trainer.gaussians)
-    trainer.density.setup(trainer.gaussians)
+    trainer = Trainer(config, scene, device, engine=ranks.engine(device))
+    trainer.begin_with(gaussians.map(lambda value: value.clone()))
     trainer.initialise_maps()
     return trainer
 

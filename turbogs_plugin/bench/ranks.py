@@ -23,10 +23,11 @@ from turbogs_plugin.bench.recorder import Recorder
 from turbogs_plugin.bench.step import StepBench, warm_trainer
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.device import synchronize
-from turbogs_plugin.distributed.exchange import RankExchange
+from turbogs_plugin.distributed import ranks_engine
 from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.processes import joined, start
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
+from turbogs_plugin.distributed.ranks_engine import RanksEngine
 from turbogs_plugin.distributed.rows import OwnedRows
 from turbogs_plugin.distributed.shared_pass import SharedScreen
 from turbogs_plugin.errors import TrainingStopped
@@ -44,7 +45,7 @@ PARTS = ("draw", "arrival", "render", "colors", "loss", "backward", "records", "
 
 @dataclass(frozen=True)
 class Way:
-    """Of an exchange: attributes of `RankExchange`."""
+    """Of an exchange: attributes of `RanksEngine`."""
 
     by_rows: bool = True
     in_place: bool = True
@@ -114,16 +115,17 @@ class RanksBench:
         step = replace(self.step, pixel_budget=factor * self.step.pixel_budget)
         name = "none"
         trainer = warm_trainer(step.config_of(views), scene, model, device, ranks)
-        if isinstance(trainer.exchange, RankExchange):
+        if isinstance(trainer.engine, RanksEngine):
             trainer.complete()
-            trainer.exchange.by_rows, trainer.exchange.in_place = way.by_rows, way.in_place
+            ranks_engine.OWNERS_FROM = 0 if way.by_rows else 1 << 62
+            trainer.engine.in_place = way.in_place
             for _ in range(3):
                 trainer.step()
-            name = f"{'owners of rows' if way.by_rows else 'records to all'}, {trainer.exchange.way}"
+            name = f"{'owners of rows' if way.by_rows else 'records to all'}, {trainer.engine.way}"
         wall = back_to_back(trainer.step, step.repeats, device)
         parts = self._parts(trainer, device)
         trainer.repeat_lost(wait=True)
-        trainer.compare_replicas()
+        trainer.complete()
         everywhere = {name: [median] for name, median in parts.items()}
         if isinstance(ranks, ProcessRanks):
             medians = ranks.gather_numbers([round(1e3 * parts.get(name, 0.0)) for name in PARTS])
@@ -143,9 +145,9 @@ class RanksBench:
         recorder = Recorder(device)
         places = [(trainer.pixel_sampler, "sample", "draw"), (trainer, "supervise", "loss")]
         places.append((trainer.engine, "update", "solve"))
-        if isinstance(trainer.exchange, RankExchange):
-            places += [(trainer.exchange, "_gather_colors", "colors"), (SharedScreen, "of_rows", "records")]
-            places += [(OwnedRows, "begin", "parameters"), (OwnedRows, "finish", "arrival")]
+        if isinstance(trainer.engine, RanksEngine):
+            places += [(trainer.engine, "_gather_colors", "colors"), (SharedScreen, "of_rows", "records")]
+            places += [(OwnedRows, "gather_parameters", "parameters")]
             places += [(InPlace, "stepped", "barrier")]
         with recorder.passes(trainer, "render", "backward"), recorder.calls(*places):
             for _ in range(self.step.repeats):

@@ -85,5 +85,5 @@ def build(kind: str, mapping: Any) -> Any:
         remedy = f"inherit from turbogs_plugin.strategies.{PROTOCOLS[kind]} for the defaults, and write the rest"
         raise InputError(f"{kind}.type '{type_name}' is no {PROTOCOLS[kind]}: it lacks {', '.join(missing)}; {remedy}")
     for attribute, default in absent.items():
-        setattr(strategy, attribute, default)
+        object.__setattr__(strategy, attribute, default)  # of a frozen dataclass, too
     return strategy

@@ -25,7 +25,7 @@ SETTINGS = {
     "TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES": "1",
     "TORCH_SYMM_MEM_DISABLE_MULTICAST": "1",
 }
-"""Of torch's symmetric memory, unless the environment has others."""
+"""Environment variables of torch's symmetric memory, where the environment does not set them."""
 
 MESSAGES_VARIABLE = "TURBOGS_EXCHANGE"
 """Environment variable; ``messages`` in one process keeps all from sharing memory."""
@@ -34,19 +34,19 @@ LINKS_MAX = 18
 """NVLinks of a GPU."""
 
 PROOF_MILLISECONDS = 60_000
-"""After so long without an answer from another GPU, the first barrier ends the process. Later ones wait for ever, as
+"""Time without an answer from another GPU after which the first barrier ends the process. Later ones wait for ever, as
 the first process may evaluate for an hour; a process that is lost is noticed by its launcher."""
 
 
 LEAST, SMALL = 1 << 24, 1 << 26
-"""Numbers that a memory for many has at least, 64 MiB; and below which there is room to spare, 256 MiB."""
+"""Least size of a memory that holds many numbers, 64 MiB; and the size below which it grows twofold, 256 MiB."""
 
 ALIGNMENT = 64
-"""What lies in a memory begins at a multiple of so many numbers."""
+"""Alignment of what lies in a memory, in numbers of four bytes."""
 
 
 def with_room(numbers: int, least: int = 0) -> int:
-    """What a memory that must grow for so many numbers gets: twice as much while it is small, as all processes wait for
+    """Size of a memory that must grow to `numbers`: twice as many while it is small, as all processes wait for
     each other and their GPUs when it grows; else a quarter more. At least `least`."""
     return max(least, 2 * numbers if numbers < SMALL else numbers + numbers // 4)
 
@@ -86,7 +86,7 @@ def share_memory(ranks: ProcessRanks, size: int, device: torch.device) -> PeerMe
         return None
     for name, value in SETTINGS.items():
         os.environ.setdefault(name, value)
-    memory = None
+    memory: PeerMemory | None = None
     # Step by step, so that none waits in one for a process that failed in the step before.
     for step in (_allocate, _map, _prove):
         try:
@@ -100,8 +100,8 @@ def share_memory(ranks: ProcessRanks, size: int, device: torch.device) -> PeerMe
     return memory
 
 
-def _allocate(ranks: ProcessRanks, size: int, memory: None) -> PeerMemory | None:
-    """This process's part."""
+def _allocate(ranks: ProcessRanks, size: int, nothing: PeerMemory | None) -> PeerMemory | None:
+    """Allocate this process's part."""
     import torch.distributed._symmetric_memory as symmetric
 
     one_host = os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE")
@@ -116,19 +116,24 @@ def _allocate(ranks: ProcessRanks, size: int, memory: None) -> PeerMemory | None
     return PeerMemory([own.zero_()], lambda channel: None)
 
 
-def _map(ranks: ProcessRanks, size: int, memory: PeerMemory) -> PeerMemory:
-    """All parts."""
+def _map(ranks: ProcessRanks, size: int, allocated: PeerMemory | None) -> PeerMemory | None:
+    """Map all parts."""
     import torch.distributed._symmetric_memory as symmetric
 
-    (own,) = memory.parts
-    handle = symmetric.rendezvous(own, torch.distributed.group.WORLD)
+    group = torch.distributed.group.WORLD
+    if allocated is None or group is None:
+        return None
+    (own,) = allocated.parts
+    handle = symmetric.rendezvous(own, group)
     parts = [handle.get_buffer(rank, (size,), torch.float32) for rank in range(ranks.count)]
     parts[ranks.rank] = own
     return PeerMemory(parts, handle.barrier, handle)
 
 
-def _prove(ranks: ProcessRanks, size: int, memory: PeerMemory) -> PeerMemory | None:
-    """The same, if what a process writes is what the others read."""
+def _prove(ranks: ProcessRanks, size: int, memory: PeerMemory | None) -> PeerMemory | None:
+    """Return `memory` if every process reads what the others write, else None."""
+    if memory is None:
+        return None
     memory.parts[ranks.rank][:1] = ranks.rank + 1.0
     memory.owner.barrier(channel=0, timeout_ms=PROOF_MILLISECONDS)
     found = torch.cat([part[:1] for part in memory.parts]).tolist()

@@ -43,7 +43,7 @@ RUN_ID = "TORCHELASTIC_RUN_ID"
 """The variable that a launcher gives each of its processes, and none has without one, as under Slurm."""
 
 PR_SET_PDEATHSIG = 1
-"""Of Linux' prctl."""
+"""Option of Linux' `prctl`: the signal that a process gets when its parent ends."""
 
 
 def launched() -> bool:
@@ -65,7 +65,7 @@ def start(count: int, arguments: Sequence[str], device: str = "auto", module: st
         module: in the place of the command's.
 
     Returns:
-        The exit code: 0, or that of the process that ended first with an error. It says itself why.
+        The exit code: 0, or the code of the process that ended first with an error, which says itself why.
 
     Raises:
         InputError: fewer GPUs answer.

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine import Engine, engine_of
 from turbogs_plugin.errors import TrainingStopped
 
 Value = TypeVar("Value")
@@ -49,6 +50,10 @@ class Ranks:
     def ask_to_stop(self, signal: int) -> bool:
         """Ask that all stop. False: there are no others, so the caller stops by itself."""
         return False
+
+    def engine(self, device: torch.device) -> Engine:
+        """The engine of a training on this process's device, together with the others'."""
+        return engine_of(device, for_training=True)
 
     def meet(self, device: torch.device) -> None:
         """Connect the processes' GPUs, so that no exchange waits for it: NCCL takes up to half a second. Every process
@@ -118,7 +123,7 @@ class ProcessRanks(Ranks):
 
     @_answered
     def gather_numbers(self, values: list[int]) -> list[list[int]]:
-        """Some integers of every process, as many of each; rank after rank."""
+        """Integers of every process, equally many of each; rank after rank."""
         own = torch.tensor(values, dtype=torch.int64)
         parts = [torch.empty_like(own) for _ in range(self.count)]
         self._distributed.all_gather(parts, own)
@@ -126,29 +131,16 @@ class ProcessRanks(Ranks):
 
     @_answered
     def broadcast(self, tensor: Tensor, source: int = 0) -> None:
-        """Overwrite a contiguous tensor by that of rank `source`."""
+        """Overwrite a contiguous tensor by rank `source`'s."""
         self._distributed.broadcast(tensor, src=source)
 
     @_answered
-    def gather(self, tensor: Tensor) -> Tensor:
-        """[count, ...]: the tensors of all processes, of one shape, rank after rank."""
-        gathered = tensor.new_empty(self.count, *tensor.shape)
+    def gather(self, tensor: Tensor, gathered: Tensor | None = None) -> Tensor:
+        """[count, ...]: the tensors of all processes, of one shape, rank after rank. `gathered`: to be overwritten."""
+        if gathered is None:
+            gathered = tensor.new_empty(self.count, *tensor.shape)
         self._all_gather(gathered.flatten(0, 1), tensor)
         return gathered
-
-    @_answered
-    def begin_gather(self, tensor: Tensor, gathered: Tensor) -> Callable[[], None]:
-        """Like `gather` into `gathered` [count, ...], beside other work.
-
-        Returns:
-            What to call before it is used. Both tensors must live until then, and stay as they are.
-        """
-        work = self._all_gather(gathered.flatten(0, 1), tensor, async_op=True)
-        return lambda: self._wait(work)
-
-    @_answered
-    def _wait(self, work: Any) -> None:
-        work.wait()
 
     @_answered
     def send_and_receive(self, sent: list[tuple[int, Tensor]], received: list[tuple[int, Tensor]]) -> None:
@@ -167,6 +159,11 @@ class ProcessRanks(Ranks):
     def ask_to_stop(self, signal: int) -> bool:
         self.asked = signal
         return True
+
+    def engine(self, device: torch.device) -> Engine:
+        from turbogs_plugin.distributed.ranks_engine import RanksEngine  # which is made of this class
+
+        return RanksEngine(engine_of(device, for_training=True), self, device)
 
     def meet(self, device: torch.device) -> None:
         # Not on a CPU: gloo takes exchanges of two threads in the order in which they come, which processes differ in.

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from turbogs_plugin.distributed.in_place import InPlace, records_for
+from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
-from turbogs_plugin.engine.protocol import Engine
-from turbogs_plugin.engine.rendered import Rendered, RenderOptions, ScreenGradients, ScreenRecords
+from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.rendered import Projected, Rendered, RenderOptions, ScreenGradients, ScreenRecords
+from turbogs_plugin.engine.shared import SharedEngine
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 
@@ -21,11 +22,12 @@ class Batch:
     """What the processes render together in a step, and which share of the samples each has.
 
     Args:
+        engine: this process's.
         memory: in which all read the records; None: they are sent.
     """
 
     ranks: ProcessRanks
-    engine: Engine
+    engine: SharedEngine
     gaussians: Gaussians
     cameras: Cameras
     samples: PixelSamples
@@ -35,33 +37,31 @@ class Batch:
 
 
 @dataclass
-class SharedRendered:
-    """One forward pass of several processes.
+class SharedRendered(Rendered):
+    """One forward pass of several processes: `colors` are of all samples, `alphas` [0] and `depths` are not shared."""
 
-    Args:
-        colors: [P, 3], of all samples.
-    """
-
-    colors: Tensor
     _batch: Batch
-    _rendered: Rendered | None
+    _rendered: Rendered | None  # this process's share; None: it has no samples
 
-    def backward(
-        self, color_gradients: Tensor, pixel_errors: Tensor | None = None, *, with_statistics: bool = False
-    ) -> SharedScreen:
-        """Back-propagate this process's views to the screen. Arguments: of all samples, as in `Rendered.backward`."""
+    def projected(self) -> Projected:
+        raise NotImplementedError("the projection of all views is on no single process")
+
+    def _backward(self, upstream: dict[str, Tensor | None], with_statistics: bool) -> SharedScreen:
+        """Back-propagate this process's views to the screen."""
         plain = None
         if self._rendered is not None:
             slots = self._batch.shares[self._batch.ranks.rank].slots
-            errors = None if pixel_errors is None else pixel_errors[slots]
-            screen = self._rendered.backward(color_gradients[slots], errors, with_statistics=with_statistics)
-            plain = screen.plain()
+            colors, errors = upstream["color_gradients"], upstream["pixel_errors"]
+            if colors is None or upstream["alpha_gradients"] is not None or upstream["depth_gradients"] is not None:
+                raise NotImplementedError("several processes train by gradients of colors alone")
+            own_errors = None if errors is None else errors[slots]
+            plain = self._rendered.backward(colors[slots], own_errors, with_statistics=with_statistics).plain()
         return SharedScreen(self._batch, plain, with_statistics)
 
 
 @dataclass
 class SharedScreen:
-    """Gradients on the screen, each view's on the process that rendered it."""
+    """Gradients on the screen (`ScreenGradients`), each view's on the process that rendered it."""
 
     _batch: Batch
     _plain: ScreenRecords | None
@@ -74,29 +74,38 @@ class SharedScreen:
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
         """`ScreenGradients.parameter_gradients`, of all views and Gaussians, on every process."""
-        return self.whole().parameter_gradients(rows, stats)
+        whole = self.whole()
+        if self._batch.memory is not None:  # no step in place follows, which would keep the next pass behind this
+            self._batch.memory.stepped()
+        return whole.parameter_gradients(rows, stats)
+
+    def full_records(self) -> Tensor:
+        return self.whole().full_records()
+
+    def plain(self) -> ScreenRecords:
+        return self.whole().plain()
 
     def whole(self) -> ScreenGradients:
-        """Of all views and Gaussians."""
+        """Gradients of all views and Gaussians."""
         gaussians = self._batch.gaussians
         return self.of_rows([slice(0, len(gaussians))] * self._batch.ranks.count, gaussians)
 
     def of_rows(self, rows: Sequence[slice], own: Gaussians) -> ScreenGradients:
-        """Of all views, for some rows.
+        """Gradients of all views, for some rows.
 
         Args:
-            rows: those that each process wants.
+            rows: what each process wants.
             own: the Gaussians of this process's rows.
         """
         batch, device = self._batch, own.device
-        mine = rows[batch.ranks.rank]
+        records = torch.empty(self.views, len(own), ScreenRecord.SIZE, device=device)
+        radii = torch.empty(self.views, len(own), 2, dtype=torch.int32, device=device)
+        target = ScreenRecords(records, radii, self._with_statistics)
         if batch.memory is None:
-            target = records_for(self.views, mine.stop - mine.start, device, self._with_statistics)
             self._send_and_receive(rows, target)
         else:
-            target = batch.memory.target(self.views, mine.stop - mine.start, device, self._with_statistics)
-            count = len(batch.gaussians)
-            batch.memory.collect(batch.engine, batch.shares, count, self._plain, target, mine.start)
+            count, first = len(batch.gaussians), rows[batch.ranks.rank].start
+            batch.memory.collect(batch.engine, batch.shares, count, self._plain, target, first)
         return batch.engine.screen_gradients(own, batch.cameras, batch.samples, batch.options, target)
 
     def _send_and_receive(self, rows: Sequence[slice], target: ScreenRecords) -> None:

@@ -72,7 +72,8 @@ def _cut(view_ends: np.ndarray, slot_ends: np.ndarray, count: int) -> list[Share
         before = max(0, after - 1)
         tile = before if wanted - slots[before] < slots[after] - wanted else after
         cuts.append(max(cuts[-1], int(view) if abs(slots[view] - wanted) <= NEARLY * even else tile))
-    shares, begun = [], 0  # views that earlier shares have begun
+    shares: list[Share] = []
+    begun = 0  # views that earlier shares have begun
     cuts.append(len(slots) - 1)
     for first, end in itertools.pairwise(cuts):
         seen = slice(begun, begun)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from signal import SIGTERM
 
+from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.train.clock import TrainingClock
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.pace import IterationPace, Pace
@@ -45,18 +46,22 @@ class TrainingLoop:
         pace: where to stop on the way, and where to end; None: after the configured iterations.
         listeners: called in this order.
         seconds: training time that passed before.
-
-    Where several processes train the model, each has such a loop; the first one's clock counts.
+        ranks: the processes that train the model; each has such a loop, and the first one's clock counts.
     """
 
     def __init__(
-        self, trainer: Trainer, pace: Pace | None = None, listeners: Iterable[Listener] = (), seconds: float = 0.0
+        self,
+        trainer: Trainer,
+        pace: Pace | None = None,
+        listeners: Iterable[Listener] = (),
+        seconds: float = 0.0,
+        ranks: Ranks = ONE,
     ) -> None:
         self.trainer = trainer
         self.pace = pace or IterationPace(trainer.config.train)
         self.listeners = list(listeners)
         self.clock = TrainingClock(trainer.device, seconds)
-        self.ranks = trainer.ranks
+        self.ranks = ranks
         self.stopped = False
 
     def run(self, resumed: bool = False) -> None:
@@ -66,7 +71,7 @@ class TrainingLoop:
             resumed: the trainer's state was loaded, so its error maps are there.
 
         Raises:
-            TrainingStopped: the model is lost, another process ended, or the processes' models differ.
+            TrainingStopped: the model is lost, another process ended, or devices hold different models.
         """
         trainer, pace, clock = self.trainer, self.pace, self.clock
         if not resumed:
@@ -86,7 +91,7 @@ class TrainingLoop:
             if self.finished:
                 trainer.conclude()
             if due.evaluate or due.save:
-                trainer.compare_replicas()
+                trainer.complete()
             if due.evaluate:
                 for listener in self.listeners:
                     listener.evaluation_due(self)

@@ -42,7 +42,7 @@ class IterationPace:
     """
 
     def __init__(self, train: TrainConfig) -> None:
-        self.iterations = train.iterations
+        self.iterations = int(train.iterations)
         self.refine_until = train.refine_until
         self._evaluations = train.evaluation_iterations()
         self._save_every = train.checkpoint_every or self.iterations
@@ -79,7 +79,7 @@ class TimePace:
     """
 
     def __init__(self, train: TrainConfig, seconds: float) -> None:
-        self.iterations = train.iterations
+        self.iterations = int(train.iterations)
         self.refine_until = train.refine_until
         self._seconds = seconds
         self._refine_share = min(1.0, self.refine_until / self.iterations)
@@ -155,7 +155,7 @@ def fitted_to_time(config: Config, scene: Scene, device: torch.device, ranks: Ra
     count = TRIAL_ITERATIONS[device.type]
     whole, timed = TrainingClock(device), TrainingClock(device)
     with whole:
-        trial = Trainer(without_growth(config), scene, device, ranks=ranks)
+        trial = Trainer(without_growth(config), scene, device, engine=ranks.engine(device))
         trial.iteration = config.train.iterations // 2  # views, pixels and bands of an iteration are near their means
         for clock in (TrainingClock(device), timed):
             with clock:

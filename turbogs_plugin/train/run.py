@@ -72,7 +72,8 @@ def new_loop(config: Config, scene: Scene, device: torch.device, ranks: Ranks = 
         raise InputError(f"schedule: {views} views an iteration, and a GPU takes at most {MAX_VIEWS}: ask for fewer")
     hold_to_limit(config, device)
     config, seconds = fitted_to_time(within_memory(_agreed(config, ranks), scene), scene, device, ranks)
-    return TrainingLoop(Trainer(config, scene, device, ranks=ranks), pace_of(config), seconds=seconds)
+    trainer = Trainer(config, scene, device, engine=ranks.engine(device))
+    return TrainingLoop(trainer, pace_of(config), seconds=seconds, ranks=ranks)
 
 
 def budget_text(config: Config) -> str:
@@ -208,7 +209,8 @@ def resume(
     hold_to_limit(config, device)
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
         resuming = state is not None
-        loop = TrainingLoop(Trainer(config, scene, device, resuming, ranks), pace_of(config))
+        trainer = Trainer(config, scene, device, resuming, ranks.engine(device))
+        loop = TrainingLoop(trainer, pace_of(config), ranks=ranks)
         session = RunSession(folder, plan, scene, loop, clock)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))

@@ -115,7 +115,7 @@ class RunSession(Listener):
                 loop.run(self.resumed)
                 self.clock.mark("training")
                 if loop.stopped and trainer.iteration != self._saved_at:
-                    trainer.compare_replicas()
+                    trainer.complete()
                     self._save()
             self.signal = None if loop.finished else ranks.stop_signal or interrupts.signal
             if not ranks.first:

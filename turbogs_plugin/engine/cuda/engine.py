@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine import layout
+from turbogs_plugin.engine.base import BaseEngine
 from turbogs_plugin.engine.cuda import exposure, launches, library, training
 from turbogs_plugin.engine.cuda.raster import (
     Buffers,
@@ -18,14 +19,14 @@ from turbogs_plugin.engine.cuda.raster import (
 )
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.exposures import Exposures
-from turbogs_plugin.engine.protocol import Engine, MapUpdate, PassMemory
+from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
 from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, RenderOptions, ScreenRecords
 from turbogs_plugin.engine.rules import LossTerms
-from turbogs_plugin.scene.photos import PhotoSamples
+from turbogs_plugin.engine.shared import PassMemory
 from turbogs_plugin.types import BLACK, Cameras, Gaussians, LossOutput, PixelSamples
 
 
-class CudaEngine(Engine):
+class CudaEngine(BaseEngine):
     """`Engine` on one CUDA device, on torch's current stream, float32.
 
     Args:
@@ -62,8 +63,8 @@ class CudaEngine(Engine):
 
     def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
         arrays = [array for source in sources for array in (source.records, source.radii)]
-        arrays = launches.Sources(*arrays, *(None,) * (2 * layout.MAX_PEERS - len(arrays)))
-        library.launch(launches.CollectRecords(target.records, target.radii, arrays, list(views), row))
+        padded = launches.Sources(*arrays, *(None,) * (2 * layout.MAX_PEERS - len(arrays)))
+        library.launch(launches.CollectRecords(target.records, target.radii, padded, list(views), row))
 
     def lend(self, memory: PassMemory | None) -> None:
         if self.workspace is not None:
@@ -80,7 +81,7 @@ class CudaEngine(Engine):
         library.launch(launch)
         return launch.colors
 
-    def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
+    def supervise(self, terms: LossTerms, colors: Tensor, truth: GroundTruth, update: MapUpdate) -> LossOutput:
         # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel.
         # If only one of the two is in host memory, they do not.
         photos, starts = truth.photos.colors, update.maps.offsets[list(truth.samples.view_ids)]

@@ -22,8 +22,10 @@ from turbogs_plugin.engine.cuda.raster import CudaScreenGradients, count_filled,
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import MAX_PEERS, STRUCTURES, UNITS, UPDATE_KINDS
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.protocol import MapUpdate, ModelCopies
+from turbogs_plugin.engine.protocol import MapUpdate
+from turbogs_plugin.engine.rendered import ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
+from turbogs_plugin.engine.shared import ModelCopies
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds, slots_of_tiles
 from turbogs_plugin.types import (
@@ -254,7 +256,7 @@ def _loss_output(slots: int, device: torch.device, workspace: Workspace | None) 
 
 def fused_step(
     rule: UpdateRule,
-    screen: CudaScreenGradients,
+    screen: ScreenGradients,
     gaussians: Gaussians,
     moments: GaussianMoments,
     stats: GaussianStats | None = None,
@@ -264,12 +266,14 @@ def fused_step(
     `stats`, and leaves nothing of use in `screen.records`.
 
     Args:
-        screen: of at most `MAX_VIEWS` views.
+        screen: of a backward pass of this engine and at most `MAX_VIEWS` views.
         gaussians: the model that `screen` was made from: float32, contiguous.
         moments: its optimizer state, float32.
         copies: of `gaussians`, `MAX_PEERS` - 1 at most.
     """
     library.require()
+    if not isinstance(screen, CudaScreenGradients):
+        raise TypeError(f"fused_step: {type(screen).__name__} is not of a pass of the kernels")
     drawn = screen.scene.gaussians
     if gaussians is not drawn and any(
         value.data_ptr() != getattr(drawn, name).data_ptr() for name, value in gaussians.items()

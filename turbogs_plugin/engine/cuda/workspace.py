@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX, PassStatus
-from turbogs_plugin.engine.protocol import PassMemory
+from turbogs_plugin.engine.shared import PassMemory
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Gaussians
 

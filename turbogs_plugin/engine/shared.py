@@ -1,0 +1,141 @@
+"""What an engine offers to another one that trains with several GPUs, of which each has such an engine.
+
+A process renders its share of a batch; what its passes leave lies in memory that other processes read (`PassMemory`),
+and its step may change their copies of the model too (`ModelCopies`).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+from torch import Tensor
+
+from turbogs_plugin.engine.layout import PassStatus
+from turbogs_plugin.engine.moments import GaussianMoments
+from turbogs_plugin.engine.protocol import Engine
+from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients, ScreenRecords
+from turbogs_plugin.engine.rules import UpdateRule
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples
+
+
+@dataclass
+class PassMemory:
+    """Memory of the caller, which others read, for what passes leave. Contiguous, aligned to 16 bytes.
+
+    Args:
+        status: [3] int32, `layout.PassStatus`.
+        colors, radii, records: flat float32, int32 and float32, from whose start on a pass keeps as many as it has.
+    """
+
+    status: Tensor
+    colors: Tensor
+    radii: Tensor
+    records: Tensor
+
+    @cached_property
+    def overflow(self) -> Tensor:
+        """[1] int32 of `status`."""
+        return self.status[PassStatus.OVERFLOW :][:1]
+
+    @cached_property
+    def stop(self) -> Tensor:
+        """[1] int32 of `status`."""
+        return self.status[PassStatus.STOP :][:1]
+
+
+@dataclass
+class ModelCopies:
+    """Copies of Gaussians, maybe in other devices' memory, that a step changes alike.
+
+    Args:
+        gaussians: the model that the step changes.
+        copies: of the model. The parameters of a copy are as far from each other as the parameters of `gaussians`.
+    """
+
+    gaussians: Gaussians
+    copies: Sequence[Gaussians]
+
+    @cached_property
+    def distances(self) -> tuple[int, ...]:
+        """Bytes from the model to each copy: from every parameter to that parameter of the copy.
+
+        Raises:
+            InputError: a copy lies otherwise.
+        """
+        filled = [(name, value) for name, value in self.gaussians.items() if value.numel()]
+        found = [{getattr(copy, name).data_ptr() - value.data_ptr() for name, value in filled} for copy in self.copies]
+        if any(len(each) != 1 for each in found):
+            raise InputError("a copy of a model must lie as the model does: its parameters as far from each other")
+        return tuple(distance for each in found for distance in each)
+
+
+class SharedEngine(Engine, Protocol):
+    """An engine whose passes and steps can be put together with other engines' of its kind."""
+
+    @abstractmethod
+    def screen_gradients(
+        self,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        samples: PixelSamples,
+        options: RenderOptions,
+        plain: ScreenRecords,
+    ) -> ScreenGradients:
+        """Screen gradients of K views from plain tensors, which several passes of engines of this kind gave.
+
+        Args:
+            gaussians: N Gaussians that were rendered, as they were then: all, or rows of them.
+            cameras, samples, options: of all K views, as the passes had them together.
+            plain: of these views and Gaussians.
+        """
+
+    def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
+        """Collect the records of all K views for some rows. What several processes have of one view is added up, in
+        their order.
+
+        Args:
+            sources: of each process with views, in their order: of V views and N Gaussians; maybe other devices'
+                memory, read in place.
+            views: first view of each, in the batch: the last one of the process before, or the next.
+            target: of K views and M Gaussians; overwritten, but for records that are off screen.
+            row: first of the M among the N.
+        """
+
+    def lend(self, memory: PassMemory | None) -> None:
+        """Let the following passes keep in this memory what it is for, if the engine keeps memory from pass to pass,
+        and as far as it fits in. None: in the engine's own."""
+
+    def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
+        """Put the colours of all processes together. If one has set `PassStatus.OVERFLOW`, so does `overflow` here.
+
+        Args:
+            parts: [.] float32 of each process, memory that begins with the bits of its `PassStatus`; maybe other
+                devices' memory, read in place.
+            first: number at which its colours begin, in each.
+            counts: samples of each.
+            seen: [2] int32, written: the largest `PassStatus.OVERFLOW` of all, and the largest `PassStatus.STOP`.
+
+        Returns:
+            [P, 3] float32, one process's after the other's; valid until the next call.
+        """
+
+    def update(
+        self,
+        rule: UpdateRule,
+        screen: ScreenGradients,
+        gaussians: Gaussians,
+        moments: GaussianMoments,
+        stats: GaussianStats | None,
+        copies: ModelCopies | None = None,
+    ) -> None:
+        """`Engine.update`. `copies`: of `gaussians`, to be changed alike."""
+
+    @abstractmethod
+    def recover(self) -> None:
+        """Prepare to repeat iterations that were skipped because another process's memory was too small: waits for the
+        device, takes in what it learned of the memory needed, and clears `overflow`."""

@@ -1,0 +1,210 @@
+"""What iterations of training change: the model, the error maps and the state of the strategies.
+
+`Trainer` makes the iterations. Here is what is done with their state as a whole: it is saved and loaded, made complete,
+taken back where an engine had too little memory, and shown.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.engine import Engine
+from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.offload import place_maps, place_views
+from turbogs_plugin.train.checkpoint import gaussians_of_state
+from turbogs_plugin.train.initial_state import first_exposures, initial_gaussians
+from turbogs_plugin.train.look import Background, Look, interpolated_exposures
+from turbogs_plugin.train.parameter_mean import ParameterMean
+from turbogs_plugin.types import Gaussians, RowUpdate, Step
+
+REPEATED_AT_MOST = 32
+"""Upper bound on the iterations that an engine skips before `Engine.settle` says so."""
+
+STATEFUL = ("maps", "view_sampler", "optimizer", "density")
+"""Attributes that have a state of their own."""
+
+
+class TrainingState:
+    """The state of one run, on one device.
+
+    Args:
+        config: the run's, in which nothing is ``auto`` any more.
+        scene: on any device.
+        device: where everything is computed and kept.
+        resuming: a state is loaded next, so that the model of `train.init` need not be there.
+        engine: does the computation.
+
+    Attributes:
+        gaussians: the model; iterations change it in place, so clone what is to be kept.
+        maps: the error maps of the training views, `views`.
+        exposures: the photos', where they are learnt.
+        parameter_mean: over the last iterations, where one is wanted.
+        iteration: how many are finished; `iterations` is T, and `refine_until` the last one of densification.
+    """
+
+    def __init__(self, config: Config, scene: Scene, device: torch.device, resuming: bool, engine: Engine) -> None:
+        train = config.train
+        self.config, self.engine, self.extent = config, engine, scene.extent
+        self.views = place_views(scene.train, device, train.photos_place)
+        self.maps = place_maps(self.views.cameras.sizes, device, train.maps_place, config.maps.beta, self.views.masks)
+        self.background = Background.of(train.background, self.views.photos.transparent)
+        self.exposures = first_exposures(scene, resuming, device) if train.exposure else None
+        self.view_sampler = config.build("view_sampler")
+        self.optimizer = config.build("optimizer")
+        self.density = config.build("density")
+        self.view_sampler.setup(self.views.cameras, scene.extent)
+        init = "points" if resuming else train.init
+        self.begin_with(initial_gaussians(scene, config, init).map(lambda tensor: tensor.to(device)))
+        self.parameter_mean = ParameterMean(train.average_last, self.learnt()) if train.average_last else None
+        self.set_length(int(train.iterations), train.refine_until)
+        self.iteration = 0
+        self.initial_error = 0.0
+        self.nonfinite_losses = torch.zeros((), dtype=torch.int64, device=device)
+        self._earliest = 0  # the iteration after the latest change of the set of Gaussians: see `repeat_lost`
+        self._before_views: deque[tuple[int, dict[str, Any]]] = deque(maxlen=REPEATED_AT_MOST)
+
+    def begin_with(self, gaussians: Gaussians) -> None:
+        """Train this model from now on, with optimizer and density control as at the start."""
+        self.place(gaussians)
+        self.optimizer.setup(self.gaussians)
+        self.density.setup(self.gaussians)
+
+    def place(self, gaussians: Gaussians) -> None:
+        """Take this model, where the engine wants it. The present one is let go before memory for it is taken."""
+        self.gaussians = gaussians
+        self.gaussians = self.engine.place(gaussians)
+
+    def change_rows(self, update: RowUpdate) -> None:
+        """Make this change of the set of Gaussians: model, optimizer and density control follow it, row by row."""
+        if self.parameter_mean is not None:
+            self.parameter_mean.restart()
+        self.place(update.apply(self.gaussians))
+        self.optimizer.apply(update)
+        self.density.apply(update)
+        self._earliest = self.iteration + 1
+
+    def set_length(self, iterations: int, refine_until: int) -> None:
+        """Set T and tau_until, the last iteration of densification. A time budget changes them during a run."""
+        self.iterations, self.refine_until = iterations, refine_until
+
+    @property
+    def now(self) -> Step:
+        """The present state of training, as strategies see it."""
+        return Step(self.iteration, self.iterations, self.refine_until, self.config.train.seed, self.extent)
+
+    @property
+    def device(self) -> torch.device:
+        """Where everything is computed and kept."""
+        return self.gaussians.device
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest degree of spherical harmonics in use."""
+        return self.config.train.sh_degree_at(self.iteration)
+
+    def learnt(self) -> dict[str, Tensor]:
+        """All tensors that iterations learn, by name: the model's, and the exposures of the photos."""
+        exposures = {} if self.exposures is None else {"exposures": self.exposures.offsets}
+        return {**dict(self.gaussians.items()), **exposures}
+
+    def conclude(self) -> None:
+        """At the end of a run: the model becomes the mean of the last iterations, if there is one."""
+        if self.parameter_mean is not None:
+            self.parameter_mean.overwrite(self.learnt())
+
+    def look(self, photos: Sequence[str]) -> Look:
+        """How the present model is shown beside photos that are not trained, by their names."""
+        exposures = None
+        if self.exposures is not None:
+            exposures = interpolated_exposures(self.exposures.offsets, self.views.names, photos)
+        return Look(self.sh_degree, self.config.raster, self.background.evaluated, exposures)
+
+    def remember_views(self) -> None:
+        """Keep the view sampler's state before it selects the views of this iteration, for `repeat_lost`."""
+        self._before_views.append((self.iteration, self.view_sampler.state_dict()))
+
+    def repeat_lost(self, wait: bool = False) -> None:
+        """Go back by the iterations that were skipped: where the engine has too little memory for an iteration, that
+        one and those after it change nothing until the engine is settled. They are made again with the views they had;
+        otherwise, views that take much memory would be looked at less often.
+
+        Training never goes back past a change of the set of Gaussians, which would then be made twice: iterations
+        skipped just before such a change are lost.
+
+        Args:
+            wait: wait for the GPU, to know of all of them.
+
+        Raises:
+            InputError: an iteration has more intersections of a tile and a splat than a pass can have.
+        """
+        lost, last = self.engine.settle(wait), self.iteration
+        self.iteration = max(last - lost, min(self._earliest, last))
+        if lost and self.parameter_mean is not None:
+            self.parameter_mean.take_back(self.learnt(), self.iteration + 1, last, self.iterations)
+        while lost and self._before_views and self._before_views[-1][0] >= self.iteration:
+            _, state = self._before_views.pop()
+            self.view_sampler.load_state_dict(state)
+
+    def complete(self) -> None:
+        """Make the whole state valid, before it is evaluated or saved. Raises `TrainingStopped` as `Engine.verify`."""
+        self.engine.complete(self.optimizer.moments, self.density.stats)
+        self.engine.verify(self.state_dict)
+
+    def require_finite(self) -> None:
+        """Stop a run whose model is lost.
+
+        Raises:
+            TrainingStopped: a parameter is not finite, which later iterations would not repair.
+        """
+        for name, tensor in self.gaussians.items():
+            bad = int((~tensor.isfinite()).reshape(len(tensor), -1).any(dim=1).sum()) if tensor.numel() else 0
+            if bad:
+                raise TrainingStopped(
+                    f"iteration {self.iteration}: {name} of {bad} of {len(tensor)} Gaussians are not finite"
+                )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that iterations change, as plain tensors and numbers.
+
+        A resume from it is bit for bit the same on a CPU: there is no generator to save, as all randomness is a
+        function of (seed, iteration, place) (`turbogs_plugin.engine.reference.philox`).
+        """
+        return {
+            "iteration": self.iteration,
+            "initial_error": self.initial_error,
+            "nonfinite_losses": int(self.nonfinite_losses),
+            "gaussians": dict(self.gaussians.items()),
+            **({} if self.exposures is None else {"exposures": self.exposures.state_dict()}),
+            **({} if self.parameter_mean is None else {"parameter_mean": self.parameter_mean.state_dict()}),
+            **{name: getattr(self, name).state_dict() for name in STATEFUL},
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Load what `state_dict` gave, of the same configuration and scene.
+
+        An untrusted state must first be compared with the present one (`checkpoint.require_like`). In a run with a time
+        budget, call `set_length` before.
+
+        Raises:
+            ValueError: the parts of the state do not fit each other, or not this trainer.
+        """
+        if not 0 <= state["iteration"] <= self.iterations or state["nonfinite_losses"] < 0:
+            raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
+        self.iteration = state["iteration"]
+        self._before_views.clear()
+        self.initial_error = state["initial_error"]
+        self.nonfinite_losses.fill_(state["nonfinite_losses"])
+        self.begin_with(gaussians_of_state(state, self.device))
+        if self.exposures is not None:
+            self.exposures.load_state_dict(state["exposures"])
+        if self.parameter_mean is not None:
+            self.parameter_mean.load_state_dict(state["parameter_mean"], self.learnt())
+        for name in STATEFUL:
+            getattr(self, name).load_state_dict(state[name])
