@@ -1,12 +1,10 @@
-"""The synthetic capture of `bench step`, and the way of one that does not fit, at a size that does."""
-
-import json
+"""The synthetic capture of tests, and the way of one that does not fit, at a size that does."""
 
 import numpy as np
 import pytest
 import torch
+from helpers.synthetic_capture import synthetic_scene
 
-from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.scene import Scene
@@ -54,18 +52,3 @@ def test_it_trains_from_host_memory(scene):
     assert trainer.maps.window_bytes == 4 * (4 * 48 * 32 + 1)
     assert trainer.views.photos.window_bytes == 3 * (4 * 48 * 32 + 1)
     assert np.array_equal(trainer.maps.offsets, trainer.views.photos.offsets)
-
-
-def test_bench_step_tells_what_offload_costs(turbogs, tmp_path):
-    out = tmp_path / "step.json"
-    options = ["--photos", 6, "--size", 20, 16, "--gaussians", 60, "--views", 2, "--repeats", 1, "--training", 0]
-    code, printed, error = turbogs("bench", "step", *options, "--offload", "--device", "cpu", "--out", out)
-    assert code == 0, error
-    (entry,) = json.loads(out.read_text())["passes"]
-    assert list(entry["offload"]) == ["photos", "maps", "both"]
-    both = entry["offload"]["both"]
-    assert both["wall"]["median_ms"] > 0
-    assert both["bytes_in"] == 2 * 20 * 16 * 7 and both["bytes_out"] == 2 * 20 * 16 * 4
-    assert both["window_bytes"] == 7 * (4 * 20 * 16 + 1)
-    assert entry["offload"]["maps"]["bytes_in"] == 2 * 20 * 16 * 4
-    assert "both in host memory: wall" in printed

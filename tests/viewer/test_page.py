@@ -14,7 +14,6 @@ import pytest
 import torch
 from helpers.framework_runs import TINY, assert_identical
 
-from turbogs_plugin import cli
 from turbogs_plugin.engine.rendering import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
@@ -230,8 +229,8 @@ def test_without_viser_one_line_names_the_extra(turbogs, tmp_path, capture, monk
 def test_a_command_with_a_viewer_shows_the_model_until_ctrl_c(capture, tmp_path):
     pytest.importorskip("viser")
     out = tmp_path / "run"
-    command = ["train", capture, "--out", out, "--no-report", "--device", "cpu", "--viewer", "0", *TINY]
-    command += ["train.iterations=2", "train.refine_until=1", "train.evaluate_at=[]"]
+    changes = [*TINY, "train.iterations=2", "train.refine_until=1", "train.evaluate_at=[]"]
+    command = ["train", capture, *changes, "--out", out, "--no-report", "--device", "cpu", "--viewer", "0"]
     # A shell starts what it puts into the background with SIGINT ignored, and children inherit that.
     heeding = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
     process = subprocess.Popen(
@@ -250,21 +249,6 @@ def test_a_command_with_a_viewer_shows_the_model_until_ctrl_c(capture, tmp_path)
     rest, err = process.communicate(timeout=60)
     assert process.returncode == 0 and rest == "", err
     assert "viewer  http://localhost:" in err and "Traceback" not in err and "viser" not in said + err
-
-
-@pytest.mark.parametrize(
-    ("given", "taken"),
-    [
-        (["train", "S", "--viewer"], ["train", "S", "--viewer", "8080"]),
-        (["train", "S", "--viewer", "--out", "R"], ["train", "S", "--viewer", "8080", "--out", "R"]),
-        (["train", "S", "--viewer", "9000", "--out", "R"], ["train", "S", "--viewer", "9000", "--out", "R"]),
-        (["train", "--viewer", "train.iterations=3"], ["train", "--viewer", "8080", "train.iterations=3"]),
-        (["train", "S", "--viewer=9"], ["train", "S", "--viewer=9"]),
-        (["view", "R"], ["view", "R"]),
-    ],
-)
-def test_a_viewer_has_a_usual_port(given, taken):
-    assert cli._with_port(given) == taken
 
 
 @pytest.fixture
