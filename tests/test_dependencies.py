@@ -10,8 +10,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from turbogs_plugin import cli
-from turbogs_plugin.__main__ import main
+from turbogs_plugin import commands
+from turbogs_plugin.cli import main
 from turbogs_plugin.doctor import COMMAND_PACKAGES, INSTALL_COMMANDS
 
 if sys.version_info >= (3, 11):
@@ -156,7 +156,7 @@ def lacking(parser: bool) -> set[str]:
 
 
 def test_every_command_is_tried_without_the_extra():
-    assert set(cli.COMMANDS) == {*COMMANDS, "doctor"}
+    assert set(commands.COMMANDS) == {*COMMANDS, "doctor"}
 
 
 @pytest.mark.parametrize("parser", [False, True])

@@ -1,4 +1,4 @@
-"""The command line: its commands, and the words after them. Modules of `turbogs_plugin.commands` say the rest."""
+"""The `turbogs` command. Its commands are in `turbogs_plugin.commands`, which need packages that the core does not."""
 
 from __future__ import annotations
 
@@ -7,28 +7,55 @@ import gc
 import itertools
 import sys
 import warnings
+from types import ModuleType
 
 from PIL import Image
 
 from turbogs_plugin import __version__
-from turbogs_plugin.commands import captures, machine, models, studies, training
-from turbogs_plugin.commands.parsing import Command, help_text, parsed
 from turbogs_plugin.errors import InputError, exit_code
 
-COMMANDS: dict[str, Command] = {
-    "train": training.train,
-    "plan": training.plan,
-    "eval": models.evaluate,
-    "render": models.render,
-    "export": models.export,
-    "view": models.view,
-    "reconstruct": captures.reconstruct,
-    "ablate": studies.ablate,
-    "report": studies.report,
-    "bench": machine.bench,
-    "demo": captures.demo,
-    "doctor": machine.doctor,
-}
+
+def main() -> None:
+    """Run the command line. Where the extra ``train`` is absent, one line says what the command lacks."""
+    atexit.register(gc.freeze)  # or the collector walks through all of torch at the end, for a second
+    setattr(warnings, "formatwarning", _warning_line)  # noqa: B010
+    Image.MAX_IMAGE_PIXELS = None  # phones take 200 megapixels; photos are checked against cameras and memory
+    sys.exit(exit_code(lambda: _run(sys.argv[1:])))
+
+
+def _run(words: list[str]) -> int:
+    if words == ["--version"]:
+        print(f"turbogs {__version__}")
+        return 0
+    try:
+        from turbogs_plugin.commands import COMMANDS
+        from turbogs_plugin.commands.parsing import help_text, parsed
+
+        if words in ([], ["--help"], ["-h"]):
+            print(help_text(COMMANDS))
+            return 0
+        _require_usable(words)
+        return parsed(COMMANDS, words)()
+    except (ImportError, AttributeError) as error:
+        from turbogs_plugin.doctor import COMMAND_PACKAGES, INSTALL_COMMANDS, diagnosis, lacking_packages
+
+        lacking = lacking_packages()
+        if not lacking or _package_of(error) not in COMMAND_PACKAGES:
+            raise
+        if words == ["doctor"]:  # which needs none of them, but for the parser of its name
+            print(diagnosis())
+            return 0
+        verb = next((text for text in words[:1] if not text.startswith("-")), "")
+        raise InputError(f"{f'turbogs {verb}'.strip()} needs {', '.join(lacking)}: {INSTALL_COMMANDS}") from error
+
+
+def _package_of(error: ImportError | AttributeError) -> str:
+    """The top package of the module that cannot be imported, or that is there and lacks a name (another version)."""
+    if isinstance(error, ImportError):
+        name = error.name
+    else:
+        name = error.obj.__name__ if isinstance(error.obj, ModuleType) else ""
+    return (name or "").partition(".")[0]
 
 
 def _require_usable(words: list[str]) -> None:
@@ -38,36 +65,14 @@ def _require_usable(words: list[str]) -> None:
         if any("\ud800" <= letter <= "\udfff" for letter in text):
             raise InputError(f"{text!a} is not UTF-8, in which reports and configurations are written: rename it")
     for before, text in itertools.pairwise(["", *words]):
-        if text.startswith("--") and text.endswith("="):
-            before, text = text[:-1], ""
-        if not text:
-            which = before if before.startswith("-") else "an argument is"
+        if text == "" or (text.startswith("--") and text.endswith("=")):
+            which = text[:-1] or (before if before.startswith("-") else "an argument is")
             raise InputError(f"{which} '': write a value, as . for the current folder, or leave it out")
 
 
 def _warning_line(message: Warning | str, *place: object) -> str:
     """A warning on one line, without the place in the source."""
     return f"turbogs: warning: {' '.join(str(message).split())}\n"
-
-
-def _command() -> int:
-    words = sys.argv[1:]
-    if words in ([], ["--help"], ["-h"]):
-        print(help_text(COMMANDS))
-        return 0
-    if words == ["--version"]:
-        print(f"turbogs {__version__}")
-        return 0
-    _require_usable(words)
-    return parsed(COMMANDS, words)()
-
-
-def main() -> None:
-    """The `turbogs` command."""
-    atexit.register(gc.freeze)  # or the collector walks through all of torch at the end, for a second
-    setattr(warnings, "formatwarning", _warning_line)  # noqa: B010
-    Image.MAX_IMAGE_PIXELS = None  # phones take 200 megapixels; photos are checked against cameras and memory
-    sys.exit(exit_code(_command))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any
 
@@ -33,11 +32,6 @@ STAGES = {
 
 RATES = (1.0, 0.1)
 """Sampling rates that are timed with the fewest views, beside the rate of the pixel budget: 1 is a dense pass."""
-
-
-def stages_recorded(recorder: Recorder) -> AbstractContextManager[None]:
-    """While entered, each launch of a stage is recorded under the stage's name."""
-    return recorder.calls(*((library.operators, operator, stage) for operator, stage in STAGES.items()))
 
 
 def bench_raster(scene: Scene, models: Iterable[Gaussians], views: Sequence[int], repeats: int) -> dict[str, Any]:
@@ -98,7 +92,7 @@ def time_passes(
     if isinstance(render(), CudaRendered):
         whole()
         recorder = Recorder(device)
-        with stages_recorded(recorder):
+        with recorder.calls(*((library.operators, operator, stage) for operator, stage in STAGES.items())):
             measure(whole, repeats, device)
         measured["stages"] = {stage: device_times(calls[-repeats:]) for stage, calls in recorder.spans.items()}
     measured["forward_backward"] = measure(whole, repeats, device)

@@ -196,7 +196,7 @@ def memory(trainer: Trainer, scene: Scene, peak: int, held: int) -> dict[str, in
         "raster_workspace": trainer.engine.bytes_held,
     }
     if trainer.device.type != "cuda":
-        return {**stored, "temporary": None, "peak": None}
+        return stored | {"temporary": None, "peak": None}
     # What a training run would not have: test photos and the bench's copy.
     shared = trainer.views.photos.colors.data_ptr() == scene.train.photos.stored.data_ptr()
     peak -= held - (stored["training_photos"] if shared else 0)

@@ -114,7 +114,7 @@ class Recorder:
 
     Attributes:
         spans: name -> spans in the order of the calls.
-        rendered, samples: those of the latest forward pass that `passes` recorded.
+        rendered, samples: those of the latest forward pass of a trainer that is `recorded`.
     """
 
     rendered: Rendered
@@ -143,20 +143,6 @@ class Recorder:
                 stack.enter_context(patch.object(owner, function, self.timed(name, getattr(owner, function))))
             yield
 
-    @contextmanager
-    def passes(self, trainer: Trainer, forward: str, backward: str) -> Iterator[None]:
-        """While entered, the trainer's forward passes are recorded, and the backward passes of what they render."""
-        timed = self.timed(forward, trainer.engine.render)
-
-        def render(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, *options: Any) -> Rendered:
-            rendered: Any = timed(gaussians, cameras, samples, *options)
-            rendered.backward = self.timed(backward, rendered.backward)
-            self.rendered, self.samples = rendered, samples
-            return rendered
-
-        with patch.object(trainer.engine, "render", render):
-            yield
-
     def summaries(self) -> dict[str, dict[str, Summary]]:
         """Step -> times on the device and on the host, after the device has been waited for."""
         summaries = {}
@@ -169,6 +155,14 @@ class Recorder:
 @contextmanager
 def recorded(trainer: Trainer, recorder: Recorder) -> Iterator[Callable[[], None]]:
     """While entered, the steps of this trainer's iterations are recorded; gives its iteration."""
+    forward = recorder.timed("FWD", trainer.engine.render)
+
+    def render(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, *options: Any) -> Rendered:
+        rendered: Any = forward(gaussians, cameras, samples, *options)
+        rendered.backward = recorder.timed("BWD", rendered.backward)
+        recorder.rendered, recorder.samples = rendered, samples
+        return rendered
+
     places = (
         (trainer.schedule, "query", "budget"),
         (trainer.view_sampler, "select", "GVS"),
@@ -177,5 +171,5 @@ def recorded(trainer: Trainer, recorder: Recorder) -> Iterator[Callable[[], None
         (trainer, "update", "solve+update"),
         (trainer.density, "update", "EDC"),
     )
-    with recorder.passes(trainer, "FWD", "BWD"), recorder.calls(*places):
+    with patch.object(trainer.engine, "render", render), recorder.calls(*places):
         yield recorder.timed("iteration", trainer.step)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -61,26 +62,19 @@ class RunOptions:
         from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config, require_one_length
         from turbogs_plugin.plan.caps import with_cap
 
-        budget = budget_overrides(self.max_memory, self.time_budget)
+        if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
+            raise InputError("scene.path is what SCENE says: leave the override out")
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise InputError(f"--max-gaussians {self.max_gaussians}: it must be at least 1; leave it out for no limit")
-        if self.factor is not None and self.factor < 1:
-            raise InputError(f"--factor {self.factor}: it must be at least 1; leave it out for whole photos")
-        if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
-            raise InputError(f"scene.path is what SCENE says ('{scene}'): leave the override out")
-        asked = DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *budget)
+        given = {"scene.factor": self.factor, "train.device": self.device, "train.init": self.init}
+        more = (*settings_of(given), *budget_overrides(self.max_memory, self.time_budget))
+        asked = DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *more)
         settings = load_config(*asked)
         require_one_length(*asked)
         if self.max_gaussians is not None:
             settings = with_cap(settings, self.max_gaussians)
         if scene is not None:
             settings.scene.path = str(scene)
-        if self.factor is not None:
-            settings.scene.factor = self.factor
-        if self.device is not None:
-            settings.train.device = self.device
-        if self.init is not None:
-            settings.train.init = self.init
         return settings
 
 
@@ -117,16 +111,14 @@ Given = Annotated[GivenOptions, arg(name="")]
 NO_SCENE = GivenOptions()
 
 
+def settings_of(given: Mapping[str, object]) -> tuple[str, ...]:
+    """Options as overrides: name of a setting -> value, or None where the option is absent."""
+    return tuple(f"{name}={json.dumps(value)}" for name, value in given.items() if value is not None)
+
+
 def budget_overrides(max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
     """The options of a budget as overrides."""
-    from turbogs_plugin.config.units import parse_bytes, parse_seconds
-
-    if max_memory is not None:
-        read_amount("--max-memory", max_memory, parse_bytes)
-    if time_budget is not None:
-        read_amount("--time-budget", time_budget, parse_seconds)
-    given = {"max_memory": max_memory, "time": time_budget}
-    return tuple(f"budget.{name}={value!r}" for name, value in given.items() if value is not None)
+    return settings_of({"budget.max_memory": max_memory, "budget.time": time_budget})
 
 
 def read_amount(option: str, text: str, parse: Callable[[str], float]) -> float:

@@ -9,10 +9,10 @@ import sys
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from inspect import Parameter, getdoc, signature
 from types import NoneType
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -23,7 +23,7 @@ from turbogs_plugin.errors import InputError
 Command = Callable[..., int]
 
 NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
-"""Type of an option -> what it takes, in words."""
+"""Type of a value -> what is taken, in words."""
 
 
 def help_text(commands: Mapping[str, Command]) -> str:
@@ -38,8 +38,8 @@ def help_text(commands: Mapping[str, Command]) -> str:
 def parsed(commands: Mapping[str, Command], words: Sequence[str]) -> Callable[[], int]:
     """The call that a command line asks for. `--help` after a command prints its options and leaves.
 
-    Words of a command whose last positional parameter is a tuple of words, as changes of the configuration are, may
-    stand anywhere: tyro leaves over those behind an option, and they are added to the others.
+    Changes of the configuration, where a command takes them, may stand anywhere: tyro leaves over those behind an
+    option, and they are added to the others.
 
     Args:
         commands: verb -> function.
@@ -52,38 +52,57 @@ def parsed(commands: Mapping[str, Command], words: Sequence[str]) -> Callable[[]
     if verb not in commands:
         raise InputError(f"no such command '{verb}': {nearest(verb, commands)}")
     function, said = commands[verb], io.StringIO()
+
+    @functools.wraps(function)
+    def later(*arguments: Any, **options: Any) -> functools.partial[int]:
+        return functools.partial(function, *arguments, **options)
+
     try:
         with redirect_stderr(said):
-            call, left = tyro.cli(_later(function), prog=f"turbogs {verb}", args=rest, return_unknown_args=True)
+            call, left = tyro.cli(later, prog=f"turbogs {verb}", args=rest, return_unknown_args=True)
     except SystemExit as end:
         if end.code != 2:
             raise
-        raise InputError(f"turbogs {verb}: {mistake(function, rest)}; see turbogs {verb} --help") from None
-    if left and (any(map(is_option, left)) or not takes_words(function)):
-        raise InputError(f"turbogs {verb}: {mistake(function, rest)}; see turbogs {verb} --help")
+        call, left = None, rest
+    takes = Taken.by(function)
+    if call is None or (left and (any(map(is_option, left)) or not takes.changes)):
+        raise InputError(f"turbogs {verb}: {takes.mistake(rest)}; see turbogs {verb} --help")
     sys.stderr.write(said.getvalue())
-    *first, last = call.args or ((),)
-    return functools.partial(function, *first, (*last, *left), **call.keywords) if left else call
+    if not left:
+        return call
+    *first, changes = call.args
+    return functools.partial(function, *first, (*changes, *left), **call.keywords)
 
 
-def _later(function: Command) -> Callable[..., functools.partial[int]]:
-    """A function with the parameters of a command, which gives the command's call."""
-
-    @functools.wraps(function)
-    def given(*arguments: Any, **options: Any) -> functools.partial[int]:
-        return functools.partial(function, *arguments, **options)
-
-    return given
+def is_option(word: str) -> bool:
+    return word.startswith("--") or (word.startswith("-") and word[1:2].isalpha())
 
 
-class Parsed(NamedTuple):
-    """What a parameter takes. `kind`: its type, of a tuple its members' type. `many`: it is a tuple."""
+@dataclass(frozen=True)
+class Value:
+    """What an option or a positional parameter takes.
+
+    Args:
+        kind: its type; of a tuple, the type of its members.
+        many: whether it is a tuple.
+        required: whether it has no default.
+    """
 
     kind: Any
-    many: bool = False
+    many: bool
+    required: bool
+
+    @staticmethod
+    def of(hint: Any, required: bool = False) -> Value:
+        """The value of a type hint, whatever notes for tyro it has and whether None is in it."""
+        many = False
+        while get_origin(hint) in (Annotated, tuple) or NoneType in get_args(hint):
+            many = many or get_origin(hint) is tuple
+            hint = next(member for member in get_args(hint) if member is not NoneType)
+        return Value(hint, many, required)
 
     def refusal(self, word: str) -> str:
-        """What the parameter takes, in words, where it does not take this one; else empty."""
+        """What is taken, in words, where this word is not; else empty."""
         if get_origin(self.kind) is Literal and word not in get_args(self.kind):
             *others, last = get_args(self.kind)
             return f"{', '.join(others)} or {last}"
@@ -95,83 +114,71 @@ class Parsed(NamedTuple):
         return ""
 
 
-def parsed_type(hint: Any) -> Parsed:
-    """What a parameter with this type hint takes, whatever notes for tyro the hint has and whether None is in it."""
-    if get_origin(hint) is Annotated:
-        return parsed_type(get_args(hint)[0])
-    members = [member for member in get_args(hint) if member not in (NoneType, Ellipsis)]
-    if get_origin(hint) is tuple:
-        return Parsed(parsed_type(members[0]).kind, many=True)
-    return parsed_type(members[0]) if NoneType in get_args(hint) else Parsed(hint)
+@dataclass(frozen=True)
+class Taken:
+    """The words that a command takes: values by position and by option, each with its name as a user reads it."""
 
+    positional: dict[str, Value]
+    options: dict[str, Value]
 
-def takes_words(function: Command) -> bool:
-    """Whether the last positional parameter of a command is a tuple of words."""
-    positional = [name for name, each in signature(function).parameters.items() if each.kind is each.POSITIONAL_ONLY]
-    hints = get_type_hints(function, include_extras=True)
-    return bool(positional) and parsed_type(hints[positional[-1]]) == Parsed(str, many=True)
+    @staticmethod
+    def by(function: Command) -> Taken:
+        taken, hints = Taken({}, {}), get_type_hints(function, include_extras=True)
+        for name, parameter in signature(function).parameters.items():
+            value = Value.of(hints[name], parameter.default is Parameter.empty)
+            if parameter.kind is Parameter.POSITIONAL_ONLY:
+                choices = get_args(value.kind) if get_origin(value.kind) is Literal else (name.upper(),)
+                taken.positional["|".join(choices)] = value
+            elif is_dataclass(value.kind):
+                types = get_type_hints(value.kind, include_extras=True)
+                for field in fields(value.kind):
+                    taken.options[f"--{field.name.replace('_', '-')}"] = Value.of(types[field.name])
+            else:
+                taken.options[f"--{name.replace('_', '-')}"] = value
+                if parameter.default is True:
+                    taken.options[f"--no-{name.replace('_', '-')}"] = value
+        return taken
 
+    @property
+    def changes(self) -> bool:
+        """Whether the command takes changes of the configuration, or other words without end."""
+        return any(value.many and value.kind is str for value in self.positional.values())
 
-def is_option(word: str) -> bool:
-    return word.startswith("--") or (word.startswith("-") and word[1:2].isalpha())
+    def mistake(self, words: Sequence[str]) -> str:
+        """The first thing that the command does not take of these words, which tyro refused, and what to write."""
+        loose, given, rest = [], set(), deque(words)
+        while rest:
+            word = rest.popleft()
+            if not is_option(word):
+                loose.append(word)
+                continue
+            name, equals, text = word.partition("=")
+            name = name.replace("_", "-")
+            given.add(name)
+            if name not in self.options:
+                return f"there is no {name}: {self._instead(name, text or (rest[0] if rest else ''))}"
+            value, texts = self.options[name], [text] if equals else []
+            while rest and not is_option(rest[0]) and value.kind is not bool and (value.many or not texts):
+                texts.append(rest.popleft())
+            if not (texts or value.many or value.kind is bool):
+                return f"{name} lacks a value"
+            for text in texts:
+                if said := value.refusal(text):
+                    place = "; write it before the options" if OVERRIDE.fullmatch(text) else ""
+                    return f"{name} '{text}': it takes {said}{place}"
+        for word, value in zip(loose, self.positional.values(), strict=False):
+            if said := value.refusal(word):
+                return f"'{word}': it takes {said}"
+        lacking = [name for name, value in [*self.positional.items()][len(loose) :] if value.required]
+        lacking += [name for name, value in self.options.items() if value.required and name not in given]
+        if lacking:
+            return f"it needs {' and '.join(lacking)}"
+        return f"it takes no '{' '.join(loose[len(self.positional) :])}'"
 
+    def _instead(self, name: str, text: str) -> str:
+        """What to write for an option that the command does not have: a setting of that name, or the nearest option."""
+        from turbogs_plugin.config.configuration import load_config
 
-def mistake(function: Command, words: Sequence[str]) -> str:
-    """The first thing that a command does not take of these words, which tyro refused, and what to write."""
-    hints, positional, required = get_type_hints(function, include_extras=True), [], []
-    options: dict[str, Parsed] = {}
-    for name, parameter in signature(function).parameters.items():
-        found = parsed_type(hints[name])
-        if parameter.kind is Parameter.POSITIONAL_ONLY:
-            shown = "|".join(get_args(found.kind)) if get_origin(found.kind) is Literal else name.upper()
-            positional.append((shown, found, parameter.default is Parameter.empty))
-        elif is_dataclass(found.kind):
-            types = get_type_hints(found.kind, include_extras=True)
-            options |= {option_of(field.name): parsed_type(types[field.name]) for field in fields(found.kind)}
-        else:
-            options[option_of(name)] = found
-            required += [option_of(name)] if parameter.default is Parameter.empty else []
-            if parameter.default is True:
-                options[option_of(f"no_{name}")] = found
-    loose, rest = [], deque(words)
-    while rest:
-        word = rest.popleft()
-        if not is_option(word):
-            loose.append(word)
-            continue
-        name, equals, value = word.partition("=")
-        name = name.replace("_", "-")
-        if name not in options:
-            return f"there is no {name}: {_instead(name, rest[0] if rest else value, options, takes_words(function))}"
-        required = [each for each in required if each != name]
-        values = [value] if equals else []
-        while rest and options[name].kind is not bool and not is_option(rest[0]) and not equals:
-            values.append(rest.popleft())
-            equals = "" if options[name].many else "="
-        if not (values or options[name].many or options[name].kind is bool):
-            return f"{name} lacks a value"
-        for value in values:
-            if said := options[name].refusal(value):
-                place = "; write it before the options" if OVERRIDE.fullmatch(value) else ""
-                return f"{name} '{value}': it takes {said}{place}"
-    for word, (_, found, _) in zip(loose, positional, strict=False):
-        if said := found.refusal(word):
-            return f"'{word}': it takes {said}"
-    required = [name for name, _, needed in positional[len(loose) :] if needed] + required
-    if required:
-        return f"it needs {' and '.join(required)}"
-    return f"it takes no '{loose[len(positional)]}'" if len(loose) > len(positional) else "it cannot read these words"
-
-
-def option_of(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
-def _instead(name: str, value: str, options: Mapping[str, Parsed], with_settings: bool) -> str:
-    """What to write in the place of an option that a command does not have: a setting of that name, or the nearest."""
-    from turbogs_plugin.config.configuration import load_config
-
-    sections = load_config("turbogs").to_mapping() if with_settings else {}
-    key = name[2:].replace("-", "_")
-    settings = [f"{section}.{key}={value}" for section, values in sections.items() if key in values]
-    return f"write {' or '.join(settings)}" if settings else nearest(name, options)
+        key, sections = name[2:].replace("-", "_"), load_config("turbogs").to_mapping() if self.changes else {}
+        settings = [f"{section}.{key}={text}" for section, values in sections.items() if key in values]
+        return f"write {' or '.join(settings)}" if settings else nearest(name, self.options)
