@@ -4,15 +4,14 @@ import json
 import os
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from turbogs_plugin import cli
-from turbogs_plugin.__main__ import main
+from turbogs_plugin import commands
+from turbogs_plugin.cli import main
 from turbogs_plugin.doctor import COMMAND_PACKAGES, INSTALL_COMMANDS
 
 if sys.version_info >= (3, 11):
@@ -75,51 +74,11 @@ print("used")
 """
 
 
-AFTER_TORCH = """
-import os, sys, traceback
-import torch
-
-places, codes = sys.argv[1::2], sys.argv[2::2]
-assert not set({absent}) & set(sys.modules)
-for place, code in zip(places, codes):
-    if os.fork() == 0:
-        for name, stream in (("out", 1), ("err", 2)):
-            os.dup2(os.open(f"{{place}}.{{name}}", os.O_WRONLY | os.O_CREAT), stream)
-        os.chdir(place)
-        ended = 1
-        try:
-            exec(code, {{"__name__": "__main__"}})
-            ended = 0
-        except BaseException:
-            traceback.print_exc()
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(ended)
-    print(os.waitstatus_to_exitcode(os.wait()[1]))
-"""
-"""Runs each of several codes in a process that has nothing but torch, whose import takes longest, and in a folder of
-its own. What it says goes beside that; the exit codes are printed."""
-
-
 def run(code: str, absent: set[str], *arguments, folder: Path) -> subprocess.CompletedProcess:
     script = BLOCKED.format(absent=sorted(absent)) + code
     command = [sys.executable, "-c", script, *map(str, arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "TURBOGS_LIBRARY": str(folder / "no kernels")}
     return subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment, check=False)
-
-
-def run_after_torch(codes: dict[Path, tuple[str, set[str]]], folder: Path) -> list[subprocess.CompletedProcess]:
-    """Of `run`, for (code, what is absent) in folders."""
-    arguments = []
-    for place, (code, absent) in codes.items():
-        arguments += [place, BLOCKED.format(absent=sorted(absent)) + code]
-    done = run(AFTER_TORCH.format(absent=sorted(COMMAND_PACKAGES)), set(), *arguments, folder=folder)
-    assert done.returncode == 0, done.stderr
-    said = [[place.with_name(f"{place.name}.{stream}").read_text() for stream in ("out", "err")] for place in codes]
-    return [
-        subprocess.CompletedProcess(place, int(ended), *texts)
-        for place, ended, texts in zip(codes, done.stdout.split(), said, strict=True)
-    ]
 
 
 @pytest.fixture(scope="module")
@@ -152,16 +111,15 @@ COMMANDS = {
     "render": ("RUN",),
     "export": ("RUN",),
     "ablate": ("components", "--scene", "SCENE", "--out", "STUDY"),
-    "compare": ("RUN", "RUN", "--out", "STUDY"),
     "report": ("STUDY",),
-    "bench": ("numerics", "--out", "STUDY", "--device", "cpu"),
+    "bench": ("step", "--scene", "SCENE", "--ply", "MODEL", "--device", "cpu"),
     "demo": ("CAPTURE",),
 }
 COMMAND = "sys.argv[0] = 'turbogs'; from turbogs_plugin.__main__ import main; main()"
 
 ALL_COMMANDS = """
 import contextlib, io, json
-from turbogs_plugin.__main__ import main
+from turbogs_plugin.cli import main
 
 answers = {{}}
 for line in {lines}:
@@ -185,10 +143,12 @@ def answers(tmp_path_factory) -> dict[bool, subprocess.CompletedProcess]:
     lines = [["doctor"], *([command, *arguments] for command, arguments in COMMANDS.items())]
     code = ALL_COMMANDS.format(lines=lines)
     folders = {parser: tmp_path_factory.mktemp("lacking") for parser in (False, True)}
-    codes = {folder: (code + ("" if parser else USE), lacking(parser)) for parser, folder in folders.items()}
-    found = run_after_torch(codes, tmp_path_factory.mktemp("beside"))
+    found = {
+        parser: run(code + ("" if parser else USE), lacking(parser), folder=folder)
+        for parser, folder in folders.items()
+    }
     assert all(list(folder.iterdir()) == [] for folder in folders.values())
-    return dict(zip(folders, found, strict=True))
+    return found
 
 
 def lacking(parser: bool) -> set[str]:
@@ -196,7 +156,7 @@ def lacking(parser: bool) -> set[str]:
 
 
 def test_every_command_is_tried_without_the_extra():
-    assert set(cli.COMMANDS) == {*COMMANDS, "doctor"}
+    assert set(commands.COMMANDS) == {*COMMANDS, "doctor"}
 
 
 @pytest.mark.parametrize("parser", [False, True])
@@ -262,79 +222,22 @@ def test_the_core_changes_no_package_of_a_host(host, project):
         assert name not in core or core[name].marker is None
 
 
-def test_the_viewers_extra_is_the_one_that_its_message_names(project):
-    from turbogs_plugin.viewer.server import INSTALL
+def test_an_extra_is_the_one_that_its_message_names(project):
+    from turbogs_plugin.export import film
+    from turbogs_plugin.report import tensorboard
+    from turbogs_plugin.viewer import server
 
-    assert set(requirements(project["optional-dependencies"]["viewer"])) == {"viser"}
-    assert f'"{project["name"]}[viewer]"' in INSTALL
-
-
-def test_the_extra_for_films_is_the_one_that_its_message_names(project):
-    from turbogs_plugin.export.film import INSTALL
-
-    assert set(requirements(project["optional-dependencies"]["video"])) == {"imageio-ffmpeg"}
-    assert f'"{project["name"]}[video]"' in INSTALL
-
-
-def test_the_extra_for_tensorboard_is_the_one_that_its_message_names(project):
-    from turbogs_plugin.report.tensorboard import INSTALL
-
-    assert set(requirements(project["optional-dependencies"]["tensorboard"])) == {"tensorboard"}
-    assert f'"{project["name"]}[tensorboard]"' in INSTALL
+    extras = {
+        "viewer": ("viser", server),
+        "video": ("imageio-ffmpeg", film),
+        "tensorboard": ("tensorboard", tensorboard),
+    }
+    for extra, (package, module) in extras.items():
+        assert set(requirements(project["optional-dependencies"][extra])) == {package}
+        assert f'"{project["name"]}[{extra}]"' in module.INSTALL
 
 
 def test_what_the_core_refuses(project):
     core = requirements(project["dependencies"])
     for name, version in (("gsplat", "1.3.0"), ("gsplat", "2.0.0"), ("torch", "2.0.1")):
         assert not core[name].specifier.contains(version)
-
-
-REST = ("torch 2.7.0", "numpy 1.26.4", "pillow 10.3.0", "packaging 24.0", "pyyaml 6.0.2")
-"""Versions of what a host does not pin."""
-
-
-def pip_beside(host: tuple[str, ...], project: dict, folder: Path) -> subprocess.CompletedProcess:
-    """What pip would do with the core of our metadata, in an environment where a host's versions are installed.
-
-    No package is built or fetched: the environment has metadata alone, as has our wheel.
-    """
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder / "host"], check=True)
-    (site,) = (folder / "host").glob("lib/python*/site-packages")
-    found = dict(text.split() for text in (*REST, *host))
-    for name, version in found.items():
-        metadata = site / f"{name}-{version}.dist-info"
-        metadata.mkdir()
-        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-        (metadata / "INSTALLER").write_text("pip\n")
-    lines = ["Metadata-Version: 2.1", f"Name: {project['name']}", "Version: 1.0"]
-    lines += [f"Requires-Dist: {requirement}" for requirement in project["dependencies"]]
-    stem = "turbogs_plugin-1.0"
-    with zipfile.ZipFile(folder / f"{stem}-py3-none-any.whl", "w") as wheel:
-        wheel.writestr(f"{stem}.dist-info/METADATA", "\n".join(lines) + "\n")
-        wheel.writestr(f"{stem}.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\n")
-        wheel.writestr(f"{stem}.dist-info/RECORD", "")
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "--python",
-        folder / "host/bin/python",
-        "install",
-        "--dry-run",
-        "--no-index",
-    ]
-    command += ["--quiet", "--report", folder / "report.json", folder / f"{stem}-py3-none-any.whl"]
-    return subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
-
-
-@pytest.mark.parametrize("host", ["gsplat main", "nerfstudio 1.1.5"])
-def test_pip_installs_us_beside_a_host_and_nothing_else(host, project, tmp_path):
-    done = pip_beside(HOSTS[host], project, tmp_path)
-    assert done.returncode == 0, done.stderr
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert [found["metadata"]["name"] for found in report["install"]] == ["turbogs-plugin"]
-
-
-def test_pip_would_replace_a_gsplat_that_we_do_not_take(project, tmp_path):
-    done = pip_beside(("gsplat 1.3.0",), project, tmp_path)
-    assert done.returncode != 0 and "gsplat" in done.stderr

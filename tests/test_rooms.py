@@ -1,6 +1,10 @@
-"""What lies where, and what importing a room loads."""
+"""What lies where, how large it may be, and what importing a room loads.
+
+`python tests/test_rooms.py` prints all sizes beside their budgets.
+"""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -29,6 +33,77 @@ def test_few_modules_stand_beside_the_packages():
         "doctor",
         "__main__",
     }
+
+
+ROOT = Path(__file__).resolve().parents[1]
+
+BUDGETS = {
+    "turbogs_plugin": 22_500,
+    "turbogs_plugin/{types,tiles,masks,error_maps}": 1_100,
+    "turbogs_plugin/{errors,files,device}": 300,
+    "turbogs_plugin/engine": 4_200,
+    "turbogs_plugin/distributed": 1_150,
+    "turbogs_plugin/model": 900,
+    "turbogs_plugin/captures": 2_300,
+    "turbogs_plugin/scene": 1_150,
+    "turbogs_plugin/{config,plan}": 1_500,
+    "turbogs_plugin/train": 2_300,
+    "turbogs_plugin/reconstruct": 850,
+    "turbogs_plugin/report": 700,
+    "turbogs_plugin/study": 1_200,
+    "turbogs_plugin/viewer": 800,
+    "turbogs_plugin/export": 700,
+    "turbogs_plugin/bench": 900,
+    "turbogs_plugin/gsplat_bridge": 1_600,
+    "turbogs_plugin/{commands,cli,doctor,__main__}": 850,
+    "strategies": 2_000,
+    "csrc": 6_000,
+    "tests": 24_000,
+    "docs": 900,
+}
+"""Folder or modules -> the most lines of Python, and of CUDA in csrc.
+
+Whoever needs more takes something out, or says in the change which measured gain or named fault pays for it.
+"""
+
+MOST_PAGES, MOST_DOCUMENTS, MOST_DOCUMENT_BYTES = 20, 70, 2 << 20
+"""Pages for users in docs/, files in docs/ altogether, and their bytes."""
+
+SOURCES = {".py", ".cu", ".cuh", ".h", ".cpp"}
+
+
+def lines_of(place: str) -> int:
+    """Lines of the sources of a folder, or of ``folder/{modules}``."""
+    folder, _, names = place.partition("/{")
+    rooms = {name: ROOT / folder / name for name in names.rstrip("}").split(",")} if names else {"": ROOT / folder}
+    files = {file for room in rooms.values() for file in (*room.rglob("*"), room.with_suffix(".py"))}
+    found = (file for file in files if file.suffix in SOURCES and file.is_file())
+    return sum(len(file.read_text(encoding="utf-8").splitlines()) for file in found)
+
+
+def documents() -> list[Path]:
+    return [file for file in (ROOT / "docs").rglob("*") if file.is_file() and "__pycache__" not in file.parts]
+
+
+def sizes() -> dict[str, tuple[int, int]]:
+    """What -> (its size, the most that it may be)."""
+    found, pages = documents(), [*(ROOT / "docs").glob("*.md")]
+    return {
+        **{f"{place}, lines": (lines_of(place), most) for place, most in BUDGETS.items()},
+        "docs/*.md, pages": (len(pages), MOST_PAGES),
+        "docs, files": (len(found), MOST_DOCUMENTS),
+        "docs, bytes": (sum(file.stat().st_size for file in found), MOST_DOCUMENT_BYTES),
+    }
+
+
+def test_no_room_is_larger_than_its_budget():
+    assert {what: (size, most) for what, (size, most) in sizes().items() if size > most} == {}
+
+
+def test_every_room_has_a_budget():
+    named = {part for place in BUDGETS for part in re.split(r"[/{},]", place)}
+    rooms = {path.stem for path in (ROOT / "turbogs_plugin").iterdir() if path.suffix in ("", ".py")}
+    assert rooms - {"__init__", "__pycache__", "strategies", "configs"} <= named
 
 
 ROOMS = (
@@ -75,3 +150,8 @@ def test_training_and_its_report_load_nothing_slow_before_they_use_it(loaded):
 
 def test_a_run_without_a_report_loads_nothing_slow_but_the_reader_of_its_capture(loaded):
     assert loaded[2] & SLOW == {"pycolmap", "scipy"}
+
+
+if __name__ == "__main__":
+    for name, (found, limit) in sizes().items():
+        print(f"{name:<56} {found:>9,} of {limit:>9,}{'' if found <= limit else '  too large'}")

@@ -5,8 +5,8 @@ import gc
 
 import pytest
 import torch
+from helpers.synthetic_capture import synthetic_scene
 
-from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.error_maps import AGE_MAX

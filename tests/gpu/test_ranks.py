@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.synthetic_capture import synthetic_scene
 from PIL import Image
 
-from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.captures import write_demo_capture
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed.processes import start

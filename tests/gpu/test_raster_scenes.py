@@ -23,7 +23,7 @@ from helpers.raster_cases import (
     upstream,
 )
 
-from turbogs_plugin.bench.models import tile_samples, train
+from turbogs_plugin.bench.workloads import tile_samples, train
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.engine.reference.raster import rasterize_reference

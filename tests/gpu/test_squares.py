@@ -15,6 +15,8 @@ from helpers.statistics_cases import (
     assert_squares_that_overflow_are_survived,
     share_of_bound,
 )
+from helpers.statistics_errors import CASES as MEASURED
+from helpers.statistics_errors import measure_case, measure_window
 from helpers.stiff_tiles import (
     TILES,
     assert_structure_gradients_are_bounded,
@@ -24,8 +26,6 @@ from helpers.stiff_tiles import (
 )
 from helpers.tolerances import GPU_STATISTICS, GPU_STIFF_STATISTICS, STRUCTURE_BOUND
 
-from turbogs_plugin.bench.statistics import CASES as MEASURED
-from turbogs_plugin.bench.statistics import measure_case, measure_window
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 

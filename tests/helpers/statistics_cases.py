@@ -16,7 +16,7 @@ STIFF = (
     "needles of aspect 1e6",
     "gradients times 1e-15, squares below float32's range",
 )
-"""Cases of `turbogs_plugin.bench.statistics` with bounds of their own."""
+"""Cases of `helpers.statistics_errors` with bounds of their own."""
 
 REACH = math.sqrt(2 * math.log(1 / DEFAULT_SETTINGS.alpha_min) / DEFAULT_SETTINGS.eps2d)
 """The longest gradient of a splat's exponent with respect to its mean, 1 / pixel: its distance is at most

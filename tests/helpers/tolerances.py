@@ -47,7 +47,7 @@ STRUCTURE_BOUND = 1e-3
 
 @dataclass(frozen=True)
 class StatisticsTolerance:
-    """Bounds of density control's sums in float32 (`turbogs_plugin.bench.statistics.StatisticsResult`).
+    """Bounds of density control's sums in float32 (`helpers.statistics_errors.StatisticsErrors`).
 
     Args:
         total: of the vector of a sum over all Gaussians, L2 of the difference over L2.

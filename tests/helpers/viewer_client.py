@@ -3,7 +3,7 @@
 import time
 from typing import Any
 
-from turbogs_plugin.bench.viewer_client import Frame, ScriptedClient
+from helpers.scripted_client import Frame, ScriptedClient
 
 
 class WaitingClient(ScriptedClient):

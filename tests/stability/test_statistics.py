@@ -16,10 +16,9 @@ from helpers.statistics_cases import (
     pass_statistics,
     share_of_bound,
 )
+from helpers.statistics_errors import CASES as MEASURED
+from helpers.statistics_errors import measure_case, measure_window
 from helpers.tolerances import STATISTICS, STIFF_STATISTICS
-
-from turbogs_plugin.bench.statistics import CASES as MEASURED
-from turbogs_plugin.bench.statistics import measure_case, measure_window
 
 
 @pytest.mark.parametrize("case", MEASURED, ids=lambda case: case.name)

@@ -14,9 +14,9 @@ import pytest
 import torch
 from helpers.framework_runs import TINY, assert_identical
 from helpers.squares import SQUARES
+from helpers.synthetic_capture import synthetic_scene
 from torch import Tensor
 
-from turbogs_plugin.bench.large_capture import synthetic_scene
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.scene import Scene

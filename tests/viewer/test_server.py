@@ -201,8 +201,8 @@ def test_without_viser_one_line_names_the_extra(turbogs, tmp_path, capture, monk
 
 def test_a_command_with_a_viewer_shows_the_model_until_ctrl_c(capture, tmp_path):
     out = tmp_path / "run"
-    command = ["train", capture, "--out", out, "--no-report", "--device", "cpu", "--viewer", "0", *TINY]
-    command += ["train.iterations=2", "train.refine_until=1", "train.evaluate_at=[]"]
+    changes = [*TINY, "train.iterations=2", "train.refine_until=1", "train.evaluate_at=[]"]
+    command = ["train", capture, *changes, "--out", out, "--no-report", "--device", "cpu", "--viewer", "0"]
     # A shell starts what it puts into the background with SIGINT ignored, and children inherit that.
     heeding = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
     process = subprocess.Popen(

@@ -2,36 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any
 
+import gsplat
 import torch
-from torch import Tensor
 
-from turbogs_plugin.bench.clocks import back_to_back, copy_bandwidth, device_times, measure
 from turbogs_plugin.bench.floors import raster_counts, raster_floors
-from turbogs_plugin.bench.gsplat_dense import bench_gsplat
-from turbogs_plugin.bench.models import (
-    TRAINING_ITERATIONS,
-    ring_cameras,
-    surface_gaussians,
-    tile_samples,
-    trained_model,
-)
-from turbogs_plugin.bench.precision import precision
-from turbogs_plugin.bench.recorder import Recorder
-from turbogs_plugin.device import free_device_memory
+from turbogs_plugin.bench.timing import Recorder, back_to_back, copy_bandwidth, device_times, measure
+from turbogs_plugin.bench.workloads import PIXEL_BUDGET, tile_samples
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.cuda import library
 from turbogs_plugin.engine.cuda.raster import CudaRendered
 from turbogs_plugin.engine.rendered import Rendered
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.geometry import evenly
-from turbogs_plugin.study.cell import scene_on
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats
 
 STAGES = {
@@ -42,126 +28,115 @@ STAGES = {
     "raster_backward": "backward",
     "projection_backward": "projection backward",
 }
-"""Operators of the library, and the stage that each of them is."""
+"""Operator of the library -> the stage that it is."""
+
+RATES = (1.0, 0.1)
+"""Sampling rates that are timed with the fewest views, beside the rate of the pixel budget: 1 is a dense pass."""
 
 
-def stages_recorded(recorder: Recorder) -> AbstractContextManager[None]:
-    """While entered, each launch of a stage is recorded under the stage's name."""
-    return recorder.calls(*((library.operators, operator, stage) for operator, stage in STAGES.items()))
-
-
-@dataclass
-class RasterBench:
-    """What `turbogs bench raster` measures.
+def bench_raster(scene: Scene, models: Iterable[Gaussians], views: Sequence[int], repeats: int) -> dict[str, Any]:
+    """Time the rasterizer's passes, and gsplat's dense ones over the fewest views.
 
     Args:
-        gaussians: sizes of the models.
-        views: K; each with the rate of the pixel budget.
-        rates: further rates, with the fewest views: 1 and 0.1 are compared with gsplat's dense passes of those views.
-        pixel_budget: K times the rate (lambda).
-        size: (width, height) of the synthetic cameras; not used with a scene.
-        repeats: of each pass.
-        training: iterations of the models' training on a scene; without one they are synthetic.
-        libraries: other builds of the kernels, measured each in a process of its own.
+        scene: capture, for its cameras.
+        views: numbers of views K, each with the rate of the pixel budget.
+        repeats: timed calls of each pass.
 
-    Raises:
-        InputError: a library that is not there.
+    Returns:
+        Numbers ready for JSON; ``passes`` has an entry for each model, K and rate.
     """
+    fewest, passes, dense = min(views), [], []
+    settings = [(count, PIXEL_BUDGET / count, False) for count in views] + [(fewest, rate, False) for rate in RATES]
+    settings.append((*settings[0][:2], True))
+    for model in models:
+        cameras = scene.train.cameras.to(model.device, torch.float32)
+        bandwidth = copy_bandwidth(model.device)
+        for count, rate, density in settings:
+            chosen = cameras.select(evenly(len(cameras), count))
+            passes.append(time_passes(model, chosen, min(1.0, rate), density, repeats, bandwidth))
+        chosen = cameras.select(evenly(len(cameras), fewest))
+        dense.append({"gaussians": len(model), "views": len(chosen), **time_gsplat(model, chosen, repeats)})
+    return {
+        "scene": scene.name,
+        "image_size": scene.train.cameras.sizes.max(axis=0).tolist(),
+        "copy_bandwidth_bytes_per_s": bandwidth,
+        "passes": passes,
+        "gsplat": dense,
+    }
 
-    gaussians: Sequence[int]
-    views: Sequence[int]
-    rates: Sequence[float]
-    pixel_budget: float
-    size: tuple[int, int]
-    repeats: int
-    training: int = TRAINING_ITERATIONS
-    libraries: Sequence[Path] = ()
 
-    def __post_init__(self) -> None:
-        for path in self.libraries:
-            if not path.is_file():
-                raise InputError(f"no such library: '{path}'")
+def time_passes(
+    model: Gaussians, cameras: Cameras, rate: float, density: bool, repeats: int, bandwidth: float
+) -> dict[str, Any]:
+    """One (model, views, rate): times of the stages and of forward and backward pass, counts and floors.
 
-    def models(self, scene: Scene | None, device: torch.device) -> list[Gaussians]:
-        """The models in host memory, so that the device holds the one that is timed.
+    Args:
+        density: with the sums that density control needs.
+    """
+    device = model.device
+    samples = tile_samples(cameras.sizes, rate, device, seed=1)
+    engine = engine_of(device, for_training=True)
+    gradients = torch.randn(len(samples), 3, device=device) / len(samples)
+    errors = torch.rand(len(samples), device=device)
+    stats = GaussianStats.zeros(len(model), device) if density else None
 
-        Args:
-            scene: to train on, its photos in host memory; None: the models are synthetic.
-            device: where to train; nothing is left there.
-        """
-        if scene is None:
-            return [surface_gaussians(count, torch.device("cpu")) for count in self.gaussians]
-        placed = scene_on(scene, device)
-        trained = [trained_model(placed, count, self.training, device, ()).map(Tensor.cpu) for count in self.gaussians]
-        del placed
-        free_device_memory(device)
-        return trained
+    def render() -> Rendered:
+        return engine.render(model, cameras, samples)
 
-    def cameras(self, scene: Scene | None) -> Cameras:
-        """Those of a scene; where there is none, synthetic ones."""
-        if scene is None:
-            return ring_cameras(max(self.views), *self.size, torch.device("cpu"))
-        return scene.train.cameras.to("cpu", torch.float32)
+    def whole() -> None:
+        screen = render().backward(gradients, errors, with_statistics=density)
+        screen.parameter_gradients(rows=False, stats=stats)
 
-    def run(self, models: Sequence[Gaussians], cameras: Cameras, device: torch.device) -> dict[str, Any]:
-        """The measurements, ready for JSON, of models and cameras in host memory."""
-        cameras = cameras.to(device)
-        bandwidth = copy_bandwidth(device)
-        passes, dense = [], []
-        for held in models:
-            model = held.map(lambda value: value.to(device).contiguous())
-            settings = [(views, self.pixel_budget / views, False) for views in self.views]
-            settings += [(min(self.views), rate, False) for rate in self.rates]
-            settings.append((*settings[0][:2], True))
-            for views, rate, density in settings:
-                chosen = cameras.select(evenly(len(cameras), views))
-                passes.append(self._measure(model, chosen, min(1.0, rate), density, device, bandwidth))
-            chosen = cameras.select(evenly(len(cameras), min(self.views)))
-            dense.append({"gaussians": len(model), "views": len(chosen), **bench_gsplat(model, chosen, self.repeats)})
-        about = {"image_size": cameras.sizes.max(axis=0).tolist(), "copy_bandwidth_bytes_per_s": bandwidth}
-        return about | {"precision": precision(device), "passes": passes, "gsplat": dense}
+    measured: dict[str, Any] = {"gaussians": len(model), "views": len(cameras), "rate": rate}
+    measured |= {"density_sums": density, "samples": len(samples)}
+    if isinstance(render(), CudaRendered):
+        whole()
+        recorder = Recorder(device)
+        with recorder.calls(*((library.operators, operator, stage) for operator, stage in STAGES.items())):
+            measure(whole, repeats, device)
+        measured["stages"] = {stage: device_times(calls[-repeats:]) for stage, calls in recorder.spans.items()}
+    measured["forward_backward"] = measure(whole, repeats, device)
+    measured["wall"] = back_to_back(whole, repeats, device)
+    rendered = render()
+    if isinstance(rendered, CudaRendered):
+        counts = raster_counts(rendered, samples)
+        measured |= {"counts": counts, "floors_ms": raster_floors(counts, bandwidth)}
+        measured["lost_passes"] = engine.settle(wait=True)
+    return measured
 
-    def _measure(
-        self, model: Gaussians, cameras: Cameras, rate: float, density: bool, device: torch.device, bandwidth: float
-    ) -> dict[str, Any]:
-        """One (model, views, rate): stages, totals, counts, floors and memory."""
-        samples = tile_samples(cameras.sizes, rate, device, seed=1)
-        engine = engine_of(device, for_training=True)
-        gradients = torch.randn(len(samples), 3, device=device) / len(samples)
-        errors = torch.rand(len(samples), device=device)
-        stats = GaussianStats.zeros(len(model), device) if density else None
 
-        def render() -> Rendered:
-            return engine.render(model, cameras, samples)
+def time_gsplat(model: Gaussians, cameras: Cameras, repeats: int) -> dict[str, Any]:
+    """Times of gsplat's forward and backward pass over every pixel, or why there are none."""
+    if not model.means.is_cuda:
+        return {"version": gsplat.__version__, "reason": "gsplat's rasterization needs a GPU"}
+    leaves = model.map(lambda value: value.clone().requires_grad_())
+    width, height = (int(side) for side in cameras.sizes[0])
+    weights = torch.randn(len(cameras), height, width, 3, device=model.device)
 
-        def whole() -> None:
-            screen = render().backward(gradients, errors, with_statistics=density)
-            screen.parameter_gradients(rows=False, stats=stats)
+    def whole(packed: bool) -> None:
+        shapes = leaves.means, leaves.quats, leaves.scales.exp(), leaves.opacities.sigmoid()
+        colors, views = torch.cat([leaves.sh0, leaves.shN], dim=1), (cameras.viewmats, cameras.Ks, width, height)
+        images, _, _ = gsplat.rasterization(
+            *shapes, colors, *views, sh_degree=leaves.sh_degree, packed=packed, absgrad=True
+        )
+        torch.autograd.grad((images * weights).sum(), [value for _, value in leaves.items()])
 
-        measured: dict[str, Any] = {"gaussians": len(model), "views": len(cameras), "rate": rate}
-        measured |= {"density_sums": density, "samples": len(samples)}
-        on_kernels = isinstance(render(), CudaRendered)
-        if on_kernels:
-            torch.cuda.reset_peak_memory_stats(device)
-            whole()
-            recorder = Recorder(device)
-            with stages_recorded(recorder):
-                measure(whole, self.repeats, device)
-            spans = recorder.spans.items()
-            measured["stages"] = {stage: device_times(calls[-self.repeats :]) for stage, calls in spans}
-        else:
-            measured["forward"] = measure(render, self.repeats, device)
-        measured["forward_backward"] = measure(whole, self.repeats, device)
-        measured["wall"] = back_to_back(whole, self.repeats, device)
-        if not on_kernels:
-            visible = (render().projected().radii > 0).any(dim=-1).any(dim=0)  # [N]
-            return {**measured, "counts": {"visible_gaussians": int(visible.sum())}}
-        counts = raster_counts(render(), samples)
-        return {
-            **measured,
-            "counts": counts,
-            "floors_ms": raster_floors(counts, bandwidth),
-            "lost_passes": engine.settle(wait=True),
-            "workspace_bytes": engine.bytes_held,
-            "peak_bytes": torch.cuda.max_memory_allocated(device),
-        }
+    ways = {"unpacked": partial(whole, False), "packed": partial(whole, True)}
+    return {"version": gsplat.__version__} | {name: measure(way, repeats, model.device) for name, way in ways.items()}
+
+
+def raster_lines(measured: dict[str, Any]) -> list[str]:
+    """One line for each pass, and one for gsplat's dense pass."""
+    lines = []
+    for entry in measured["passes"]:
+        parts = [f"{name} {value['median_ms']:.3f}" for name, value in entry.get("stages", {}).items()]
+        lines.append(
+            f"M={entry['gaussians']} K={entry['views']} r={entry['rate']:.2f}"
+            f"{' with density sums' if entry['density_sums'] else ''}: {entry['forward_backward']['median_ms']:.3f} ms"
+            + (f" | {'  '.join(parts)}" if parts else "")
+        )
+    for entry in measured["gsplat"]:
+        times = [f"{kind} {entry[kind]['median_ms']:.3f} ms" for kind in ("unpacked", "packed") if kind in entry]
+        text = ", ".join(times) or entry["reason"]
+        lines.append(f"gsplat {entry['version']} dense, M={entry['gaussians']} K={entry['views']}: {text}")
+    return lines

@@ -1,4 +1,4 @@
-"""Where each second of `turbogs train` goes: the command in a process of its own, by the marks that it keeps."""
+"""`turbogs bench wall`: where each second of `turbogs train` goes, by the marks that the command keeps."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class WallRun:
 
     @property
     def beside_training(self) -> float:
-        """Of `ready_seconds`, those that are not training."""
+        """Seconds of `ready_seconds` that are not training."""
         return self.ready_seconds - self.train_seconds
 
     @property
@@ -95,12 +95,17 @@ def bench_wall(arguments: Sequence[str], repeats: int) -> dict[str, Any]:
 def wall_lines(measured: dict[str, Any]) -> list[str]:
     """The run in the middle, part by part, and the sums of all runs."""
     middle, runs = WallRun(**measured["median"]), [WallRun(**run) for run in measured["runs"]]
-    rows = [*middle.parts.items(), ("whole command", middle.seconds), ("training alone", middle.train_seconds)]
-    rows += [("until model, report and pictures are there", middle.ready_seconds)]
-    rows += [("beside training, until then", middle.beside_training)]
-    rows += [("from photos to the first iteration", middle.to_first_iteration)]
-    width = max(len(name) for name, _ in rows)
-    lines = [f"{name:<{width}}  {seconds:7.2f} s" for name, seconds in rows]
-    lines.insert(len(middle.parts), "-" * (width + 11))
+    sums = {
+        "whole command": middle.seconds,
+        "training alone": middle.train_seconds,
+        "until model, report and pictures are there": middle.ready_seconds,
+        "beside training, until then": middle.beside_training,
+        "from photos to the first iteration": middle.to_first_iteration,
+    }
+    width = max(map(len, (*middle.parts, *sums)))
+    parts, totals = (
+        [f"{name:<{width}}  {each:7.2f} s" for name, each in rows.items()] for rows in (middle.parts, sums)
+    )
     each = ", ".join(f"{run.beside_training:.2f}" for run in runs)
-    return [*lines, f"beside training, until then, of {len(runs)} runs: {each} s; the one in the middle is shown"]
+    last = f"beside training, until then, of {len(runs)} runs: {each} s; the one in the middle is shown"
+    return [*parts, "-" * (width + 11), *totals, last]

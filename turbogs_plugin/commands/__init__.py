@@ -1,1 +1,19 @@
 """What each command of `turbogs` takes, checks and calls. What it calls is imported when it is called."""
+
+from turbogs_plugin.commands import captures, machine, models, studies, training
+from turbogs_plugin.commands.parsing import Command
+
+COMMANDS: dict[str, Command] = {
+    "train": training.train,
+    "plan": training.plan,
+    "eval": models.evaluate,
+    "render": models.render,
+    "export": models.export,
+    "view": models.view,
+    "reconstruct": captures.reconstruct,
+    "ablate": studies.ablate,
+    "report": studies.report,
+    "bench": machine.bench,
+    "demo": captures.demo,
+    "doctor": machine.doctor,
+}

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -34,18 +35,17 @@ RunOrModel = Annotated[Positional[Path], arg(metavar="RUN|MODEL")]
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What train and plan change in a configuration.
+    """Options of train and plan that change a configuration.
 
     Args:
         config: name of a packaged configuration or a .yaml file; turbogs where absent.
         factor: scale photos down by this.
         device: where to train; auto takes a GPU where there is one.
-        max_gaussians: of the finished model (density.max_gaussians). While it grows it may have some more.
-        max_memory: of the GPU, never more than this for tensors: 2GiB, 1500MB (budget.max_memory). Photos and error
-            maps move to the host if need be, then the number of Gaussians is limited.
-        time_budget: seconds of training to end after: 20s, 2m (budget.time). The schedule is fitted to it, and
-            the pixels of an iteration or the number of Gaussians.
-        init: what to start from (train.init): points of the capture, random points, or a model trained anywhere: a
+        max_gaussians: limit of the finished model (density.max_gaussians). While it grows it may have some more.
+        max_memory: limit of tensors on the GPU: 2GiB, 1500MB (budget.max_memory). Photos and error maps move to the
+            host if need be, then the number of Gaussians is limited.
+        time_budget: time of training to end after: 20s, 2m (budget.time). The schedule is fitted to it.
+        init: start of the model (train.init): points of the capture, random points, or a model trained anywhere: a
             .ply, .splat, .spz, gsplat's .pt, a checkpoint, or a run's folder.
     """
 
@@ -57,32 +57,24 @@ class RunOptions:
     time_budget: Time = None
     init: Annotated[str | None, arg(metavar="points|random|MODEL")] = None
 
-    def settings(self, scene: Path, overrides: tuple[str, ...]) -> Config:
-        """The configuration that a command line asks for."""
+    def settings(self, scene: Path | None, overrides: tuple[str, ...]) -> Config:
+        """The configuration that a command line asks for. `scene`: None leaves the capture open."""
         from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config, require_one_length
         from turbogs_plugin.plan.caps import with_cap
 
-        budget = budget_overrides(self.max_memory, self.time_budget)
+        if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
+            raise InputError("scene.path is what SCENE says: leave the override out")
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise InputError(f"--max-gaussians {self.max_gaussians}: it must be at least 1; leave it out for no limit")
-        if self.factor is not None and self.factor < 1:
-            raise InputError(f"--factor {self.factor}: it must be at least 1; leave it out for whole photos")
-        if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
-            raise InputError(f"scene.path is '{scene}', as SCENE says: leave the override out")
-        asked = DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *budget)
+        given = {"scene.factor": self.factor, "train.device": self.device, "train.init": self.init}
+        more = (*settings_of(given), *budget_overrides(self.max_memory, self.time_budget))
+        asked = DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *more)
         settings = load_config(*asked)
         require_one_length(*asked)
         if self.max_gaussians is not None:
             settings = with_cap(settings, self.max_gaussians)
-        settings.scene.path = str(scene)
-        if self.factor is not None:
-            settings.scene.factor = self.factor
-        if self.device is not None:
-            settings.train.device = self.device
-        if self.init is not None:
-            if not self.init.strip():
-                raise InputError("--init '': write points, random, or a model's file; leave it out for points")
-            settings.train.init = self.init
+        if scene is not None:
+            settings.scene.path = str(scene)
         return settings
 
 
@@ -92,7 +84,7 @@ NO_OPTIONS = RunOptions()
 
 @dataclass(frozen=True)
 class GivenOptions:
-    """What eval, render and export need where they are given a model in the place of a run.
+    """Options of eval, render, export and view for a model in the place of a run.
 
     Args:
         scene: the capture of a model from a file: a 3DGS .ply, .splat, .spz, gsplat's .pt, or a checkpoint. Not with
@@ -107,7 +99,7 @@ class GivenOptions:
         """The capture and how to render it; None for a run, which says that itself."""
         if self.scene is None:
             if overrides or self.factor is not None:
-                raise InputError("a run goes by its own configuration: --factor and overrides need --scene SCENE")
+                raise InputError("a run uses its own configuration: --factor and overrides need --scene")
             return None
         asked = RunOptions(factor=self.factor).settings(self.scene, overrides)
         decided = asked.without_plan()
@@ -119,19 +111,14 @@ Given = Annotated[GivenOptions, arg(name="")]
 NO_SCENE = GivenOptions()
 
 
+def settings_of(given: Mapping[str, object]) -> tuple[str, ...]:
+    """Options as overrides: name of a setting -> value, or None where the option is absent."""
+    return tuple(f"{name}={json.dumps(value)}" for name, value in given.items() if value is not None)
+
+
 def budget_overrides(max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
     """The options of a budget as overrides."""
-    from turbogs_plugin.config.sections import parse_bytes, parse_seconds
-
-    for option, amount in (("--max-memory", max_memory), ("--time-budget", time_budget)):
-        if amount == "":
-            raise InputError(f"{option} '': write an amount; leave it out for no limit")
-    if max_memory is not None:
-        read_amount("--max-memory", max_memory, parse_bytes)
-    if time_budget is not None:
-        read_amount("--time-budget", time_budget, parse_seconds)
-    given = {"max_memory": max_memory, "time": time_budget}
-    return tuple(f"budget.{name}={value!r}" for name, value in given.items() if value is not None)
+    return settings_of({"budget.max_memory": max_memory, "budget.time": time_budget})
 
 
 def read_amount(option: str, text: str, parse: Callable[[str], float]) -> float:
@@ -142,10 +129,9 @@ def read_amount(option: str, text: str, parse: Callable[[str], float]) -> float:
         raise InputError(f"{option} {error}") from None
 
 
-def require_scene(command: str, scene: Path) -> None:
-    """Raise `InputError` where an override stands in the place of the capture."""
-    if OVERRIDE.fullmatch(str(scene)) and not scene.exists():
-        raise InputError(f"{command} needs a SCENE: '{scene}' is a change of a setting, no capture")
+def is_change(scene: Path) -> bool:
+    """Whether the word in the place of a capture is a change of the configuration."""
+    return OVERRIDE.fullmatch(str(scene)) is not None and not scene.exists()
 
 
 def require_positive(option: str, values: Sequence[float], most: float = math.inf) -> None:

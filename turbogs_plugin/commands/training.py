@@ -12,16 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from turbogs_plugin.commands.options import (
-    LOCAL,
-    NO_OPTIONS,
-    Count,
-    Flat,
-    Overrides,
-    Scene,
-    require_positive,
-    require_scene,
-)
+from turbogs_plugin.commands.options import LOCAL, NO_OPTIONS, PORT, Count, Flat, Overrides, Scene, is_change
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.train.clock import WallClock, process_age
 
@@ -40,7 +31,7 @@ def train(
     out: Annotated[Path | None, arg(metavar="RUN")] = None,
     resume: Annotated[Path | None, arg(metavar="RUN")] = None,
     report: bool = True,
-    viewer: Annotated[int | None, arg(metavar="[PORT]")] = None,
+    viewer: Annotated[tuple[int, ...] | None, arg(metavar="[PORT]")] = None,
     viewer_host: str = LOCAL,
     gpus: Count = None,
     options: Flat = NO_OPTIONS,
@@ -50,14 +41,15 @@ def train(
     Args:
         scene: folder of a capture: a COLMAP reconstruction, a transforms.json, NeRF-synthetic or LLFF, with its photos;
             or of photos alone, whose cameras are found first (see reconstruct).
-        overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none.
+        overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none; turbogs plan without a
+            SCENE lists all settings.
         out: new folder for the run.
         resume: folder of a stopped run to go on with, by its own configuration.
         report: at the end, write the report and its pictures; --no-report leaves model, history and checkpoints.
         viewer: show the training in a browser, at this port (8080 where none is named); afterwards its model, until
             Ctrl-C.
-        viewer_host: where the viewer listens; 0.0.0.0 lets others on the network look, and pause the training.
-        gpus: of this machine, to train one model on all of them, a process each; torchrun does the same on several
+        viewer_host: address where the viewer listens; 0.0.0.0 lets others on the network look, and pause the training.
+        gpus: number of this machine's GPUs that train one model, a process each; torchrun does the same on several
             machines. docs/scaling.md says what they gain.
     """
     clock = WallClock(process_age())
@@ -71,10 +63,12 @@ def train(
             )
     elif scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
-    else:
-        require_scene("train", scene)
-    if gpus is not None:
-        require_positive("--gpus", (gpus,))
+    elif is_change(scene):
+        raise InputError(f"train needs a SCENE: '{scene}' is a change of a setting, no capture")
+    if gpus is not None and gpus < 1:
+        raise InputError(f"--gpus {gpus}: it must be at least 1")
+    if viewer is not None and len(viewer) > 1:
+        raise InputError(f"--viewer {' '.join(map(str, viewer))}: it takes one port")
     if viewer is not None and (gpus or 1) > 1:
         raise InputError(VIEWER_ON_ONE)
     gc.disable()  # imports make a million objects and nothing to collect
@@ -85,18 +79,17 @@ def train(
 
     gc.freeze()  # so that later collections pass over them
     gc.enable()
-    settings = run.RunFolder(resume).read_config() if resume else options.settings(scene, overrides)
+    settings = options.settings(scene, overrides) if resume is None else run.RunFolder(resume).read_config()
     if resume and viewer is None and (finished := run.RunFolder(resume).finished_text(report)):
         print(finished)
         return 0
-    device = settings.train.device
     if gpus is not None and gpus > 1 and not launched():
         if out is not None:
             run.RunFolder(out).require_new()
-        return start(gpus, sys.argv[1:], device)
+        return start(gpus, sys.argv[1:], settings.train.device)
     page, watch = write_report if report else None, event_writers(settings)
-    with joined(device) as ranks, ExitStack() as pages:
-        if resume is None and restarted() and run.RunFolder(out).config.is_file():
+    with joined(settings.train.device) as ranks, ExitStack() as pages:
+        if out is not None and restarted() and run.RunFolder(out).config.is_file():
             resume = out
         live = None
         if viewer is not None:
@@ -104,9 +97,11 @@ def train(
                 raise InputError(VIEWER_ON_ONE)  # started by torchrun
             from turbogs_plugin.viewer.live import attached
 
-            live = pages.enter_context(attached(viewer, viewer_host))
+            live = pages.enter_context(attached(viewer[0] if viewer else PORT, viewer_host))
             watch.append(live.watch)
-        begin = partial(run.resume, resume) if resume else partial(run.train, settings, out)
+        folder = resume or out
+        assert folder is not None  # one of them is named
+        begin = partial(run.resume, folder) if resume else partial(run.train, settings, folder)
         session = begin(page, clock, ranks, watch)
         code = _tell(session, report) if ranks.first else 128 + session.signal if session.signal else 0
         if live is not None and session.signal is None:
@@ -114,32 +109,29 @@ def train(
     return code
 
 
-def plan(
-    scene: Annotated[Positional[Path], arg(metavar="SCENE")],
-    overrides: Overrides = (),
-    /,
-    *,
-    gpus: Count = None,
-    options: Flat = NO_OPTIONS,
-) -> int:
-    """Print what a run on a capture would decide of the settings that are `auto`, and why, without training.
+def plan(scene: Positional[Scene] = None, overrides: Overrides = (), /, *, options: Flat = NO_OPTIONS) -> int:
+    """Print what a run on a capture would decide, and why, without training; without a SCENE, every setting.
 
     Args:
-        scene: as in train.
-        overrides: as in train; train.exposure=auto leaves a setting to the plan, any other value forces it.
-        gpus: as in train; they need not be there.
+        scene: capture as in train; where absent, the settings of the configuration are printed, each with its value.
+        overrides: changes as in train; train.exposure=auto leaves a setting to the plan, any other value forces it.
     """
-    if gpus is not None:
-        require_positive("--gpus", (gpus,))
-    require_scene("plan", scene)
+    if scene is not None and is_change(scene):
+        scene, overrides = None, (str(scene), *overrides)
+    settings = options.settings(scene, overrides)
+    if scene is None:
+        from turbogs_plugin.config.listing import settings_text
+
+        print(settings_text(settings))
+        return 0
     from turbogs_plugin.train.run import plan_run
 
-    print(plan_run(options.settings(scene, overrides), gpus or 1).text())
+    print(plan_run(settings, 1).text())
     return 0
 
 
 def _tell(session: RunSession, reported: bool) -> int:
-    """Print how a training call ended; its exit code."""
+    """Print how a training call ended, and give its exit code."""
     from turbogs_plugin.report.tables import history_table
 
     folder = session.folder

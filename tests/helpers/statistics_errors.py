@@ -1,36 +1,31 @@
-"""Numerical stability: errors of density control's statistics against float64, on mild and stiff cases."""
+"""Errors of density control's statistics against float64, on mild and stiff cases; docs/lab/numerics.py prints them."""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
+from helpers.synthetic_capture import ring_cameras, surface_gaussians
 from torch import Tensor
 
-from turbogs_plugin.bench.models import ring_cameras, surface_gaussians, tile_samples
+from turbogs_plugin.bench.workloads import tile_samples
 from turbogs_plugin.engine.reference.raster import rasterize_reference
 from turbogs_plugin.engine.rendering import rasterize
-from turbogs_plugin.files import write_text_atomically
-from turbogs_plugin.report.provenance import hardware, software
-from turbogs_plugin.report.tables import table
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples
 
 COUNT, SIZE, VIEWS, RATE = 2_000, (96, 64), 3, 0.5
-"""Of every case but those of one pixel: Gaussians, pixels of a view, views, share of the pixels that is sampled."""
+"""Gaussians, (width, height) of a view, views, and the share of the pixels that is sampled, of every case."""
 
 TURNOVER = 0.05
-"""The share that an event of density control removes."""
+"""Share of the Gaussians that an event of density control removes."""
 
 SUMS = ("weight_sums", "absgrad_sums", "square_sums")
-"""The statistics that decide who goes, how many grow, and who."""
+"""Statistics that decide which Gaussians go, how many grow, and which."""
 
 LOOKS, ROWS = 12_800, 10_000
-"""Of the window whose sums are measured: 100 iterations of 128 views, and Gaussians."""
+"""Views of the window whose sums are measured, 100 iterations of 128, and its Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +58,7 @@ CASES = (
 
 
 @dataclass(frozen=True)
-class StatisticsResult:
+class StatisticsErrors:
     """Errors of one case.
 
     Args:
@@ -89,8 +84,8 @@ def least_squares(square_sums: Tensor) -> Tensor:
     return chosen
 
 
-def compared(case: str, given: GaussianStats, exact: GaussianStats) -> StatisticsResult:
-    """What sums [N] in float32 are off by from those in float64."""
+def compared(case: str, given: GaussianStats, exact: GaussianStats) -> StatisticsErrors:
+    """Errors of sums [N] in float32 against those in float64."""
     errors = {}
     for name in SUMS:
         got, wanted = getattr(given, name).double().cpu(), getattr(exact, name).double().cpu()
@@ -101,7 +96,7 @@ def compared(case: str, given: GaussianStats, exact: GaussianStats) -> Statistic
     seen = wanted > 0
     removed, kept = least_squares(got[seen]), ~least_squares(wanted[seen])
     exchanged = float((removed & kept).sum() / removed.sum().clamp(min=1))
-    return StatisticsResult(case, errors, float(relative.median()), float(relative.max()), exchanged)
+    return StatisticsErrors(case, errors, float(relative.median()), float(relative.max()), exchanged)
 
 
 def statistics_of(
@@ -123,7 +118,7 @@ def statistics_of(
     return stats
 
 
-def measure_case(case: StatisticsCase, device: torch.device) -> StatisticsResult:
+def measure_case(case: StatisticsCase, device: torch.device) -> StatisticsErrors:
     """One pass of a case."""
     gaussians, cameras = surface_gaussians(COUNT, device, seed=3), ring_cameras(VIEWS, *SIZE, device)
     case.change(gaussians)
@@ -133,7 +128,7 @@ def measure_case(case: StatisticsCase, device: torch.device) -> StatisticsResult
     return compared(case.name, statistics_of(*inputs, exact=False), statistics_of(*inputs, exact=True))
 
 
-def measure_window(device: torch.device) -> StatisticsResult:
+def measure_window(device: torch.device) -> StatisticsErrors:
     """The sums of a long window: squares over eight decades, added one by one in float32."""
     generator = torch.Generator().manual_seed(6)
     level = 10 ** (8 * torch.rand(ROWS, generator=generator, dtype=torch.float64) - 18)
@@ -144,35 +139,3 @@ def measure_window(device: torch.device) -> StatisticsResult:
             getattr(given, name).add_(look.to(device))
             getattr(exact, name).add_(look)
     return compared(f"window of {LOOKS} looks", given, exact)
-
-
-def bench_statistics(out: Path, device: torch.device) -> list[StatisticsResult]:
-    """Measure all cases, and write ``statistics.json`` (every number and the machine) and ``statistics.md``.
-
-    Args:
-        out: folder for the files; made where absent.
-        device: where the statistics are computed.
-    """
-    results = [*(measure_case(case, device) for case in CASES), measure_window(device)]
-    settings = {"gaussians": COUNT, "size": SIZE, "views": VIEWS, "rate": RATE, "looks": LOOKS, "rows": ROWS}
-    write_record(out / "statistics.json", settings, results, device)
-    write_text_atomically(out / "statistics.md", statistics_table(results) + "\n")
-    return results
-
-
-def write_record(path: Path, settings: dict[str, Any], results: Sequence[Any], device: torch.device) -> None:
-    """Write dataclasses of results, with the machine and the settings of their measurement; the folder is made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    machine = {"hardware": hardware(device.type), "software": dict(software()), "threads": torch.get_num_threads()}
-    record = {"machine": machine, "settings": settings, "results": [asdict(result) for result in results]}
-    write_text_atomically(path, json.dumps(record, indent=1).replace("NaN", "null") + "\n")
-
-
-def statistics_table(results: list[StatisticsResult]) -> str:
-    """A Markdown table of results."""
-    head = ("statistics", "weights", "absolute gradients", "squares", "one's, median", "one's, worst", "5 % exchanged")
-    rows = []
-    for result in results:
-        errors = (*(result.errors[name] for name in SUMS), result.median_square, result.worst_square)
-        rows.append((result.case, *(f"{error:.0e}" for error in errors), f"{100 * result.exchanged:.0f} %"))
-    return table(head, rows)
