@@ -21,7 +21,7 @@ from torch import Tensor
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.demo import write_demo_capture
-from turbogs_plugin.engine import rendering
+from turbogs_plugin.engine import render
 from turbogs_plugin.gsplat_bridge import sparse_rasterization
 from turbogs_plugin.model.initial import gaussians_from_points
 from turbogs_plugin.scene import Scene
@@ -106,7 +106,7 @@ def create_optimizers(
 def dense_rasterization(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """`gsplat.rasterization` by our rasterizer: the arguments and results are gsplat's, on a CPU too."""
     width, height, viewmats, Ks = kwargs["width"], kwargs["height"], kwargs["viewmats"], kwargs["Ks"]
-    samples = rendering.dense_samples(Cameras(viewmats, Ks, np.array([[width, height]] * len(viewmats))))
+    samples = render.dense_samples(Cameras(viewmats, Ks, np.array([[width, height]] * len(viewmats))))
     colors, alphas, info = sparse_rasterization(*args, samples=samples, **kwargs)
     places = samples.view_of_slot() * width * height + samples.pixel_ids.long()
     colors = torch.zeros_like(colors).index_copy(0, places, colors).reshape(-1, height, width, 3)
@@ -201,7 +201,7 @@ def mean_psnr(scene: Scene, splats: torch.nn.ParameterDict) -> float:
     gaussians = Gaussians(**dict(splats.items()))
     cameras, errors = scene.test.cameras.to(gaussians.device), []
     for view in range(len(cameras)):
-        image = rendering.render_image(gaussians, cameras, view).colors.clamp(0, 1).cpu()
+        image = render.render_image(gaussians, cameras, view).colors.clamp(0, 1).cpu()
         errors.append((image - scene.test.photos.image(view)).square().mean())
     return float((-10.0 * torch.stack(errors).log10()).mean())
 

@@ -17,7 +17,7 @@ from PIL import Image
 from turbogs_plugin import __version__, captures, cli
 from turbogs_plugin.commands import COMMANDS
 from turbogs_plugin.commands.parsing import parsed
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.renders import distinct_stems
 from turbogs_plugin.model.ply import load_ply

@@ -35,8 +35,8 @@ def lazy_face(package: str, places: Mapping[str, str]) -> Callable[[str], Any]:
 _PLACES = {
     "fit": "turbogs_plugin.train.run",
     "load_scene": "turbogs_plugin.captures",
-    "rasterize": "turbogs_plugin.engine.rendering",
-    "render_image": "turbogs_plugin.engine.rendering",
+    "rasterize": "turbogs_plugin.engine.render",
+    "render_image": "turbogs_plugin.engine.render",
 }
 
 __all__ = ["__version__", *_PLACES]

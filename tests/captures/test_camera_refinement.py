@@ -13,7 +13,7 @@ from turbogs_plugin.captures.bundle_adjustment import reprojection_errors
 from turbogs_plugin.captures.camera_refinement import _pinholes, load_and_find, refine_cameras
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed.ranks import Ranks
-from turbogs_plugin.engine.rendered import RasterSettings
+from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.model.initial import gaussians_from_points
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.inputs import read_scene

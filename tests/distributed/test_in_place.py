@@ -23,7 +23,7 @@ from turbogs_plugin.distributed.ranks_engine import RanksEngine
 from turbogs_plugin.distributed.rows import rows_of
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
-from turbogs_plugin.engine.rendered import ScreenRecords
+from turbogs_plugin.engine.render_pass import ScreenRecords
 from turbogs_plugin.engine.shared import ModelCopies, SharedEngine
 from turbogs_plugin.model.torch_file import leaves
 from turbogs_plugin.train.loop import TrainingLoop

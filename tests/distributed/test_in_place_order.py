@@ -23,7 +23,7 @@ from turbogs_plugin.distributed.shared_pass import SharedScreen
 from turbogs_plugin.distributed.shares import Share
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.rendered import ScreenRecords
+from turbogs_plugin.engine.render_pass import ScreenRecords
 
 CPU = torch.device("cpu")
 

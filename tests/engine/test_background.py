@@ -5,7 +5,7 @@ import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians, thin_out
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
-from turbogs_plugin.engine.rendering import dense_samples, rasterize, render_image
+from turbogs_plugin.engine.render import dense_samples, rasterize, render_image
 from turbogs_plugin.types import BLACK, PARAMETER_NAMES
 
 SIZES = [(37, 29), (20, 50)]

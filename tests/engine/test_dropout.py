@@ -6,8 +6,8 @@ from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.engine.reference.dropout import kept
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
-from turbogs_plugin.engine.rendered import RenderOptions
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
+from turbogs_plugin.engine.render_pass import RenderOptions
 from turbogs_plugin.engine.rules import NO_DROPOUT, Dropout
 from turbogs_plugin.types import GaussianStats
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
-from turbogs_plugin.engine.rendering import dense_samples, rasterize
+from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.types import Gaussians, GaussianStats
 
 NAN, INFINITY = float("nan"), float("inf")

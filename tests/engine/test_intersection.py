@@ -7,8 +7,8 @@ from helpers.rendering_scenes import dense_on_grid, make_cameras, make_gaussians
 
 from turbogs_plugin.engine.reference.intersection import intersect_tiles, smallest_exponents, spread
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
-from turbogs_plugin.engine.rendered import RasterSettings
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
+from turbogs_plugin.engine.render_pass import RasterSettings
 
 SETTINGS = RasterSettings()
 

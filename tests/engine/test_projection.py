@@ -10,7 +10,7 @@ from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows, rotation_matrices
 from turbogs_plugin.engine.reference.spherical_harmonics import basis, evaluate, num_bands, unit_directions
-from turbogs_plugin.engine.rendered import RasterSettings
+from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.types import Gaussians
 
 SETTINGS = RasterSettings()

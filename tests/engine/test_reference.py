@@ -11,8 +11,8 @@ from torch.autograd.function import once_differentiable
 from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference import compositing, projection
-from turbogs_plugin.engine.rendered import ALPHA_MIN_LOWEST, RasterSettings
-from turbogs_plugin.engine.rendering import dense_samples, rasterize, render_image
+from turbogs_plugin.engine.render import dense_samples, rasterize, render_image
+from turbogs_plugin.engine.render_pass import ALPHA_MIN_LOWEST, RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, PixelSamples, sample_order
 

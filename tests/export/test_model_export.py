@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from turbogs_plugin.commands.options import GivenOptions
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.export import film
 from turbogs_plugin.export.fidelity import measure_change, view_psnr
 from turbogs_plugin.export.model_export import contributions, pruned

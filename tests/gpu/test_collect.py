@@ -15,7 +15,7 @@ from turbogs_plugin.engine.cuda.engine import CudaEngine
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
 from turbogs_plugin.engine.reference.records import collect_records, gather_colors
-from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, ScreenRecords
+from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, ScreenRecords
 from turbogs_plugin.engine.shared import PassMemory, SharedEngine
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 

@@ -4,7 +4,7 @@ import torch
 from helpers.raster_cases import GPU_ONLY
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS
+from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS
 from turbogs_plugin.export.model_export import contributions, pruned
 
 pytestmark = GPU_ONLY

@@ -16,7 +16,7 @@ from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, m
 from helpers.raster_cases import GPU_ONLY
 
 from turbogs_plugin.captures.load import load_scene
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_loss, sparse_rasterization
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, loss_shares

@@ -25,8 +25,8 @@ from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.reference.draws import draw_pixels
 from turbogs_plugin.engine.reference.losses import sparse_loss
 from turbogs_plugin.engine.reference.raster import rasterize_reference
-from turbogs_plugin.engine.rendered import RenderOptions
-from turbogs_plugin.engine.rendering import rasterize
+from turbogs_plugin.engine.render import rasterize
+from turbogs_plugin.engine.render_pass import RenderOptions
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.masks import PixelMasks

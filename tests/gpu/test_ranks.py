@@ -22,7 +22,7 @@ from turbogs_plugin.distributed.processes import start
 from turbogs_plugin.distributed.replicas import digest
 from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.cuda import library as kernels
-from turbogs_plugin.engine.rendered import RenderOptions, ScreenRecords
+from turbogs_plugin.engine.render_pass import RenderOptions, ScreenRecords
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.trainer import Trainer

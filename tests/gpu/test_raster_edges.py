@@ -14,7 +14,7 @@ from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.projection import SPAN_MAX
 from turbogs_plugin.engine.reference.raster import rasterize_reference
-from turbogs_plugin.engine.rendered import RenderOptions
+from turbogs_plugin.engine.render_pass import RenderOptions
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras
 

@@ -8,8 +8,8 @@ from helpers.rendering_scenes import thin_out
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.cuda import raster as cuda
-from turbogs_plugin.engine.rendered import RenderOptions
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
+from turbogs_plugin.engine.render_pass import RenderOptions
 
 pytestmark = GPU_ONLY
 SIZE = (250, 170)

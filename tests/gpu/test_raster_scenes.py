@@ -27,7 +27,7 @@ from turbogs_plugin.bench.workloads import tile_samples, train
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.engine.reference.raster import rasterize_reference
-from turbogs_plugin.engine.rendering import rasterize
+from turbogs_plugin.engine.render import rasterize
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import GaussianStats
 

@@ -10,7 +10,7 @@ from helpers.rendering_scenes import make_cameras, make_gaussians, one_tile_of_a
 
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda.workspace import Workspace
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
 
 pytestmark = GPU_ONLY
 

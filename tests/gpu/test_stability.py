@@ -13,7 +13,7 @@ from helpers.raster_extremes import CASES, NAMES, TWO_VIEWS, assert_within, comp
 from helpers.tolerances import TOLERANCES
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.engine.rendering import dense_samples, rasterize
+from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.train.run import train
 from turbogs_plugin.train.saved_model import load_model

@@ -15,7 +15,7 @@ from turbogs_plugin.engine.cuda.raster import CudaScreenGradients
 from turbogs_plugin.engine.layout import MAX_VIEWS, ScreenRecord
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
 from turbogs_plugin.engine.reference.raster import ReferenceScreenGradients
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS
+from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS
 from turbogs_plugin.engine.shared import ModelCopies
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.learning_rates import LearningRates

@@ -6,7 +6,7 @@ from helpers.bridge_host import Host, arguments, make_cameras, make_splats
 from torch import distributed
 from torch.testing._internal.distributed.fake_pg import FakeStore
 
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_rasterization
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam

@@ -12,7 +12,7 @@ from gsplat import DefaultStrategy
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats
 
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_rasterization
 from turbogs_plugin.gsplat_bridge.gaussian_errors import screen_statistics
 

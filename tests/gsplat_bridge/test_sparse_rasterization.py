@@ -10,7 +10,7 @@ from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_spl
 from helpers.gsplat_torch import gsplat_torch_render
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_loss, sparse_rasterization

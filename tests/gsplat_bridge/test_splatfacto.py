@@ -15,7 +15,7 @@ import torch
 from gsplat import DefaultStrategy
 from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
 
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_rasterization
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from gsplat.strategy.ops import duplicate, remove, reset_opa, split
 
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.gsplat_bridge import sparse_rasterization
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras
 

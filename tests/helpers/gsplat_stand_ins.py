@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats
 
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.gsplat_bridge import sparse_rasterization
 
 COUNT, CAMERAS = 40, 2

@@ -7,7 +7,7 @@ import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 from torch import Tensor
 
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings
+from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 

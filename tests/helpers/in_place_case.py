@@ -23,7 +23,7 @@ from turbogs_plugin.distributed.ranks_engine import RanksEngine
 from turbogs_plugin.distributed.rows import RowGather
 from turbogs_plugin.distributed.shared_pass import SharedScreen
 from turbogs_plugin.engine.cuda import workspace
-from turbogs_plugin.engine.rendered import ScreenRecords
+from turbogs_plugin.engine.render_pass import ScreenRecords
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.reference.raster import rasterize_reference
-from turbogs_plugin.engine.rendered import Rendered
+from turbogs_plugin.engine.render_pass import Rendered
 
 
 class LosingEngine(ReferenceEngine):

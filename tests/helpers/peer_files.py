@@ -15,7 +15,7 @@ from torch import Tensor
 from turbogs_plugin.distributed.peer_memory import PeerMemory
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.rendered import ScreenRecords
+from turbogs_plugin.engine.render_pass import ScreenRecords
 from turbogs_plugin.engine.shared import PassMemory
 
 

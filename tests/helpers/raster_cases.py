@@ -12,7 +12,7 @@ from torch import Tensor
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.layout import ScreenRecord, columns
 from turbogs_plugin.engine.reference.raster import rasterize_reference
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 GPU_ONLY = [

@@ -9,7 +9,7 @@ import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians
 from helpers.tolerances import Tolerance
 
-from turbogs_plugin.engine.rendering import dense_samples, rasterize
+from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians
 
 NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")

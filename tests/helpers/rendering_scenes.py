@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings
-from turbogs_plugin.engine.rendering import dense_samples
+from turbogs_plugin.engine.render import dense_samples
+from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.tiles import compact, pixel_table
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 

@@ -8,8 +8,8 @@ import torch
 from helpers.raster_extremes import CASES, TWO_VIEWS, random_scene
 from helpers.squares import event
 
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS
-from turbogs_plugin.engine.rendering import dense_samples, rasterize
+from turbogs_plugin.engine.render import dense_samples, rasterize
+from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS
 from turbogs_plugin.types import SH_C0, Cameras, Gaussians, GaussianStats
 
 STIFF = (

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from turbogs_plugin.bench.workloads import tile_samples
 from turbogs_plugin.engine.reference.raster import rasterize_reference
-from turbogs_plugin.engine.rendering import rasterize
+from turbogs_plugin.engine.render import rasterize
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples
 
 COUNT, SIZE, VIEWS, RATE = 2_000, (96, 64), 3, 0.5

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch.nn.functional import normalize
 
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.geometry import look_at

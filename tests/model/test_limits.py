@@ -5,7 +5,7 @@ import pytest
 import torch
 from helpers.models import random_gaussians
 
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.model import limits
 from turbogs_plugin.model.limits import DISTANT, POINTS, RARE, SHARE, Clearance, restrain_distant
 from turbogs_plugin.types import Cameras, RowUpdate

@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers.models import random_gaussians
 
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.scene.geometry import look_at
 from turbogs_plugin.types import Cameras

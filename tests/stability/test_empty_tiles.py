@@ -8,7 +8,7 @@ import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians, thin_out
 
 from turbogs_plugin.engine.reference.losses import sparse_loss
-from turbogs_plugin.engine.rendering import dense_samples, rasterize
+from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.types import GaussianStats, PixelSamples, Step

@@ -10,7 +10,7 @@ from helpers.tolerances import TOLERANCES
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from turbogs_plugin.engine.rendering import dense_samples, rasterize
+from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.types import GaussianStats
 
 

@@ -138,7 +138,7 @@ def test_whole_tiles_begin_elsewhere_in_each_iteration():
 
 
 def test_dense_is_every_pixel_as_the_rasterizer_orders_them():
-    from turbogs_plugin.engine.rendering import dense_samples
+    from turbogs_plugin.engine.render import dense_samples
 
     maps, views = random_maps(), (4, 0, 2)
     samples = DensePixelSampler().sample(maps, views, 0.01, step(3))

@@ -11,7 +11,7 @@ from helpers.framework_runs import assert_identical, stop_after, tiny_capture, t
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.export.renders import render_run
 from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.report.run_report import write_report

@@ -10,7 +10,7 @@ from helpers.framework_runs import tiny_capture, tiny_config
 from torch import Tensor
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.metrics import evaluate, render_view
 from turbogs_plugin.train.trainer import Trainer

@@ -12,7 +12,7 @@ from PIL import Image
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.autograd import rasterize_differentiable
-from turbogs_plugin.engine.rendering import rasterize, render_image
+from turbogs_plugin.engine.render import rasterize, render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.report.images import MASKED, strip

@@ -11,7 +11,7 @@ from helpers.losing_engine import LosingEngine
 
 from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.engine.reference.update import apply_update
-from turbogs_plugin.engine.rendered import RenderOptions
+from turbogs_plugin.engine.render_pass import RenderOptions
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam

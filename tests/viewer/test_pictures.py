@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.report.images import error_picture, to_uint8
 from turbogs_plugin.types import SH_C0, Gaussians, PixelSamples, RowUpdate, Step
 from turbogs_plugin.viewer.camera import ViewerCamera

@@ -13,7 +13,7 @@ import pytest
 import torch
 from helpers.framework_runs import TINY, assert_identical
 
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.report.images import to_uint8

@@ -15,7 +15,7 @@ from turbogs_plugin.bench.workloads import PIXEL_BUDGET, tile_samples
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.cuda import library
 from turbogs_plugin.engine.cuda.raster import CudaRendered
-from turbogs_plugin.engine.rendered import Rendered
+from turbogs_plugin.engine.render_pass import Rendered
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats

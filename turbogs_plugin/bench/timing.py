@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from turbogs_plugin.device import synchronize
-from turbogs_plugin.engine.rendered import Rendered
+from turbogs_plugin.engine.render_pass import Rendered
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 

@@ -27,7 +27,7 @@ from turbogs_plugin.config.sections import (
     undecided,
 )
 from turbogs_plugin.config.typed import build_dataclass, dataclass_mapping
-from turbogs_plugin.engine.rendered import RasterSettings
+from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.errors import InputError, nearest
 from turbogs_plugin.yaml_json import packaged_names, parse_yaml, read_named_yaml, yaml_text
 

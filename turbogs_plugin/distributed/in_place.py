@@ -44,7 +44,7 @@ from turbogs_plugin.distributed.peer_memory import LEAST, PeerMemory, Sharing, a
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
 from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
-from turbogs_plugin.engine.rendered import ScreenRecords
+from turbogs_plugin.engine.render_pass import ScreenRecords
 from turbogs_plugin.engine.shared import PassMemory, SharedEngine
 from turbogs_plugin.types import Gaussians
 

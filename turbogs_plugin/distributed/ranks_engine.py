@@ -42,7 +42,7 @@ from turbogs_plugin.distributed.rows import OwnedRows, RowGather, rows_of
 from turbogs_plugin.distributed.shared_pass import Batch, SharedRendered, SharedScreen
 from turbogs_plugin.distributed.shares import Share, shares_of
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, RenderOptions, ScreenGradients
+from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import UpdateRule
 from turbogs_plugin.engine.shared import SharedEngine
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples, RowUpdate

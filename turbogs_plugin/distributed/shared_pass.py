@@ -12,7 +12,7 @@ from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.rendered import Projected, Rendered, RenderOptions, ScreenGradients, ScreenRecords
+from turbogs_plugin.engine.render_pass import Projected, Rendered, RenderOptions, ScreenGradients, ScreenRecords
 from turbogs_plugin.engine.shared import SharedEngine
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 

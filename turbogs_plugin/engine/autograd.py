@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.rendered import Projected, Rendered
-from turbogs_plugin.engine.rendering import rasterize
+from turbogs_plugin.engine.render import rasterize
+from turbogs_plugin.engine.render_pass import Projected, Rendered
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras, Gaussians, GaussianStats, PixelSamples
 

@@ -14,7 +14,7 @@ from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
 from turbogs_plugin.engine.reference.exposure import expose, exposure_gradients, step_exposures
 from turbogs_plugin.engine.reference.records import collect_records, gather_colors
 from turbogs_plugin.engine.reference.update import apply_update
-from turbogs_plugin.engine.rendered import ScreenGradients, ScreenRecords
+from turbogs_plugin.engine.render_pass import ScreenGradients, ScreenRecords
 from turbogs_plugin.engine.rules import LossTerms, UpdateRule
 from turbogs_plugin.engine.shared import ModelCopies, PassMemory, SharedEngine
 from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate

@@ -17,7 +17,7 @@ from torch import Tensor
 from turbogs_plugin.engine.layout import PassStatus
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import Engine
-from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients, ScreenRecords
+from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients, ScreenRecords
 from turbogs_plugin.engine.rules import UpdateRule
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples

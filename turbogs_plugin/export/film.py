@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from turbogs_plugin.config.configuration import Config
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.camera_path import from_file, orbit, through_views
 from turbogs_plugin.files import require_new_file, require_writable

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings
-from turbogs_plugin.engine.rendering import dense_samples, rasterize
+from turbogs_plugin.engine.render import dense_samples, rasterize
+from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.fidelity import Change, measure_change
 from turbogs_plugin.export.html_page import html_page, page_gaussians

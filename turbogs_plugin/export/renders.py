@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from turbogs_plugin.config.configuration import Config
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import naming, require_writable, unused_name
 from turbogs_plugin.report.evaluation import open_saved, views_of

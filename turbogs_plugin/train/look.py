@@ -16,7 +16,7 @@ from torch import Tensor
 
 from turbogs_plugin.config.sections import parse_color
 from turbogs_plugin.engine.reference.philox import PURPOSE_BACKGROUND, host_words
-from turbogs_plugin.engine.rendered import RasterSettings
+from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.scene.sequence import Neighbours, PhotoOrder
 from turbogs_plugin.types import BLACK, WHITE, Color, Step
 

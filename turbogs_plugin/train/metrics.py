@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from turbogs_plugin.device import peak_memory_bytes, synchronize
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.history import MEASURES, Evaluation, FurtherErrors
 from turbogs_plugin.train.look import Look

@@ -16,8 +16,8 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine, engine_of
 from turbogs_plugin.engine.exposures import exposure_rate
 from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
-from turbogs_plugin.engine.rendered import RenderOptions, ScreenGradients
-from turbogs_plugin.engine.rendering import dense_samples, rasterize
+from turbogs_plugin.engine.render import dense_samples, rasterize
+from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import Dropout
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.limits import RESTRAIN_EVERY, Clearance, restrain_distant

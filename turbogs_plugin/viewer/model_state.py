@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings
+from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.types import BLACK, Color, Gaussians, PixelSamples, RowUpdate, Step

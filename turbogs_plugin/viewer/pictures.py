@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_max_pool2d, interpolate
 
-from turbogs_plugin.engine.rendering import render_image
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, colored, depth_picture, error_picture, rounded, to_uint8
 from turbogs_plugin.scene import PosedImages

@@ -20,7 +20,7 @@ from turbogs_plugin.engine.cuda.raster import (
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
-from turbogs_plugin.engine.rendered import DEFAULT_OPTIONS, RenderOptions, ScreenRecords
+from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, RenderOptions, ScreenRecords
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.engine.shared import PassMemory
 from turbogs_plugin.types import BLACK, Cameras, Gaussians, LossOutput, PixelSamples

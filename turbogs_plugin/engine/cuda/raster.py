@@ -20,7 +20,7 @@ from turbogs_plugin.engine.cuda import launches, library
 from turbogs_plugin.engine.cuda.workspace import Kept, Workspace, require_possible, round_capacity
 from turbogs_plugin.engine.layout import InstanceRow, ParameterRow, ScreenRecord
 from turbogs_plugin.engine.moments import COLUMNS
-from turbogs_plugin.engine.rendered import (
+from turbogs_plugin.engine.render_pass import (
     DEFAULT_OPTIONS,
     Projected,
     Rendered,

@@ -23,7 +23,7 @@ from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import MAX_PEERS, STRUCTURES, UNITS, UPDATE_KINDS
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import MapUpdate
-from turbogs_plugin.engine.rendered import ScreenGradients
+from turbogs_plugin.engine.render_pass import ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.engine.shared import ModelCopies
 from turbogs_plugin.error_maps import ErrorMaps

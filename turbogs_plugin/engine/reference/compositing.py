@@ -16,7 +16,7 @@ from torch.nn.functional import threshold_
 
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.intersection import Intersections
-from turbogs_plugin.engine.rendered import RasterSettings
+from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.types import PixelSamples
 
 BLOCK_ELEMENTS = {"cpu": 1 << 18, "cuda": 1 << 24}

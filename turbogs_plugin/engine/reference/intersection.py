@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.reference.projection import Rows, Splats
-from turbogs_plugin.engine.rendered import RasterSettings
+from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.types import TILE_SIZE, PixelSamples
 
 ROUNDING = 16

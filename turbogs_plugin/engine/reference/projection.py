@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.reference.spherical_harmonics import evaluate, num_bands, unit_directions
-from turbogs_plugin.engine.rendered import EXTENT_MAX, Projected, RasterSettings
+from turbogs_plugin.engine.render_pass import EXTENT_MAX, Projected, RasterSettings
 from turbogs_plugin.types import Cameras, Gaussians
 
 SPAN_MAX = 1e7

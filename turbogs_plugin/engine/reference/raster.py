@@ -13,7 +13,7 @@ from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Compositor
 from turbogs_plugin.engine.reference.dropout import kept
 from turbogs_plugin.engine.reference.intersection import intersect_tiles
 from turbogs_plugin.engine.reference.projection import Rows, Splats, drawable_rows, project_rows
-from turbogs_plugin.engine.rendered import (
+from turbogs_plugin.engine.render_pass import (
     DEFAULT_OPTIONS,
     Projected,
     Rendered,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import PassStatus
-from turbogs_plugin.engine.rendered import ScreenRecords
+from turbogs_plugin.engine.render_pass import ScreenRecords
 
 
 def collect_records(sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.reference.raster import rasterize_reference
-from turbogs_plugin.engine.rendered import DEFAULT_SETTINGS, RasterSettings, Rendered, RenderOptions
+from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings, Rendered, RenderOptions
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
