@@ -1,5 +1,5 @@
 // Exposures: rendered colours through the affine map of their photo, the gradients of both, and a step of Adam.
-// Defined by turbogs_plugin/engine/reference/exposure.py.
+// Defined by turbogs_plugin/engine/reference/exposed_colors.py.
 //
 // The samples of a tile are of one view. Forward a warp takes a tile. Backward it takes kWarpTiles tiles one after the
 // other and adds up in registers, so that few atomics are left. The step is one block: a warp for each of the 12

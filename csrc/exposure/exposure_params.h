@@ -1,5 +1,5 @@
 // Parameters of the kernels of exposures. No torch here. Index spaces as in turbogs_plugin/types: K views of the
-// batch, P sample slots, T tiles with samples, V training views. turbogs_plugin/engine/reference/exposure.py defines
+// batch, P sample slots, T tiles with samples, V training views. turbogs_plugin/engine/reference/exposed_colors.py defines
 // all results.
 #pragma once
 

@@ -1,5 +1,5 @@
 // SSIM of the samples in Gaussian windows that end at the edge of the tile, with its gradient: a second pass of the
-// loss, which adds to what sparse_loss.cu has written. Defined by turbogs_plugin/engine/reference/window_similarity.py.
+// loss, which adds to what sparse_loss.cu has written. Defined by turbogs_plugin/engine/reference/losses.py.
 //
 // A block has a tile, a thread a pixel of it. Slots are first put in their places, so that the sums under all
 // windows are two passes of eleven products, along the rows and along the columns. Five moments of each channel go

@@ -6,7 +6,7 @@ import torch
 
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.exposures import BETA1, BETA2, EPSILON, FIRST_RATE, LAST_RATE, PULL, Exposures, exposure_rate
-from turbogs_plugin.engine.reference.exposure import expose, exposure_gradients, step_exposures
+from turbogs_plugin.engine.reference.exposed_colors import expose, exposure_gradients, step_exposures
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import PixelSamples, Step
 

@@ -57,7 +57,7 @@ def marked(cls, prefix=()):
     """An object of a class of `launches` whose every field names itself, and the fields by list in their order."""
     fields, lists = {}, {"Tensors": [], "Integers": [], "Reals": [], "rows": []}
     kinds = {"Tensor": "Tensors", "Tensor | None": "Tensors", "int": "Integers", "bool": "Integers", "float": "Reals"}
-    for name, annotation in launches.annotations(cls).items():
+    for name, annotation in launches.field_types(cls).items():
         if annotation == "list[int]":
             fields[name] = ["rows", *prefix, name]
             lists["rows"] += fields[name]

@@ -11,7 +11,7 @@ from helpers.raster_cases import GPU_ONLY
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.cuda import exposure as kernels
 from turbogs_plugin.engine.exposures import Exposures
-from turbogs_plugin.engine.reference.exposure import expose, exposure_gradients, step_exposures
+from turbogs_plugin.engine.reference.exposed_colors import expose, exposure_gradients, step_exposures
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from turbogs_plugin.engine.reference.tile_groups import TileGroups
-from turbogs_plugin.engine.reference.window_similarity import window_similarity
+from turbogs_plugin.engine.reference.losses import TileGroups, window_similarity
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.losses import EPSILON, CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss

@@ -5,7 +5,7 @@ import torch
 from helpers.framework_runs import assert_identical, stop_after, tiny_capture, tiny_config
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.engine.reference.dropout import kept
+from turbogs_plugin.engine.reference.raster import kept
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.train.run import resume, train
 from turbogs_plugin.train.trainer import Trainer

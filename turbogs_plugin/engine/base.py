@@ -11,7 +11,7 @@ from torch import Tensor
 from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
-from turbogs_plugin.engine.reference.exposure import expose, exposure_gradients, step_exposures
+from turbogs_plugin.engine.reference.exposed_colors import expose, exposure_gradients, step_exposures
 from turbogs_plugin.engine.reference.records import collect_records, gather_colors
 from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.render_pass import ScreenGradients, ScreenRecords

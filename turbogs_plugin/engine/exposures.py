@@ -47,8 +47,8 @@ class Exposures:
     @classmethod
     def identity(cls, views: int, device: torch.device | str) -> Exposures:
         """Of photos that were never updated."""
-        maps = (torch.zeros(views, 3, 4, device=device) for _ in range(3))
-        return cls(*maps, torch.zeros(views, dtype=torch.int32, device=device))
+        offsets, exp_avg, exp_avg_sq = torch.zeros(3, views, 3, 4, device=device).unbind()
+        return cls(offsets, exp_avg, exp_avg_sq, torch.zeros(views, dtype=torch.int32, device=device))
 
     @classmethod
     def of_gains(cls, gains: Tensor, device: torch.device | str) -> Exposures:

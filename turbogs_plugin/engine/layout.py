@@ -154,7 +154,7 @@ def interface(launches: list[type]) -> str:
     for name, value in globals().items():
         if isinstance(value, type):
             places = (f"{column} {place.start}:{place.stop}" for column, place in columns(value).items())
-            value = f"{', '.join(places)} of {value.SIZE}"
+            value = f"{', '.join(places)} of {vars(value)['SIZE']}"
         if name[0].isupper():
             lines.append(f"{name}: {value}")
     return "\n".join(lines)

@@ -42,10 +42,13 @@ class GaussianMoments:
     @classmethod
     def zeros(cls, gaussians: Gaussians) -> GaussianMoments:
         """The state of Gaussians that were never updated, with their dtype and device."""
-        count, coefficients = len(gaussians), gaussians.shN.shape[1] * 3
+        count, new = len(gaussians), gaussians.means.new_zeros
+        packed, coefficients = (count, ParameterRow.SIZE), (count, gaussians.shN.shape[1] * 3)
         return cls(
-            *(gaussians.means.new_zeros(count, ParameterRow.SIZE) for _ in range(2)),
-            *(gaussians.means.new_zeros(count, coefficients) for _ in range(2)),
+            new(packed),
+            new(packed),
+            new(coefficients),
+            new(coefficients),
             torch.zeros(count, dtype=torch.int32, device=gaussians.device),
             torch.zeros((), dtype=torch.int64, device=gaussians.device),
         )

@@ -77,6 +77,21 @@ def require_statistics(with_statistics: bool, stats: GaussianStats | None) -> No
         raise ValueError("statistics of a pass without them: call Rendered.backward(..., with_statistics=True)")
 
 
+@dataclass(frozen=True)
+class Upstream:
+    """What a backward pass starts from; the arguments of `Rendered.backward`."""
+
+    color_gradients: Tensor
+    alpha_gradients: Tensor | None
+    depth_gradients: Tensor | None
+    pixel_errors: Tensor | None
+
+    def contiguous(self) -> Upstream:
+        others = (self.alpha_gradients, self.depth_gradients, self.pixel_errors)
+        ready = (None if value is None else value.contiguous() for value in others)
+        return Upstream(self.color_gradients.contiguous(), *ready)
+
+
 @dataclass
 class Rendered(ABC):
     """One forward pass.
@@ -115,17 +130,13 @@ class Rendered(ABC):
         Raises:
             InputError: on CUDA, depth gradients for a pass without depths, or a tensor of wrong shape, dtype or device.
         """
-        upstream = {
-            "color_gradients": color_gradients,
-            "alpha_gradients": alpha_gradients,
-            "depth_gradients": depth_gradients,
-            "pixel_errors": pixel_errors,
-        }
-        return self._backward(upstream, with_statistics)
+        return self._backward(
+            Upstream(color_gradients, alpha_gradients, depth_gradients, pixel_errors), with_statistics
+        )
 
     @abstractmethod
-    def _backward(self, upstream: dict[str, Tensor | None], with_statistics: bool) -> ScreenGradients:
-        """`backward`, with its tensors by name."""
+    def _backward(self, upstream: Upstream, with_statistics: bool) -> ScreenGradients:
+        """`backward`, with its tensors together."""
 
 
 EXTENT_MAX = 3.33

@@ -72,7 +72,7 @@ class DrawRule:
 
 @dataclass(frozen=True)
 class Dropout:
-    """The Gaussians that a pass leaves out, as if they were not there; `engine.reference.dropout` defines which.
+    """The Gaussians that a pass leaves out, as if they were not there; `engine.reference.raster` defines which.
 
     After DropGaussian (Park et al., CVPR 2025), but opacities of the others stay as they are.
 

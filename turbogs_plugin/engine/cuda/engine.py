@@ -9,7 +9,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine import layout
 from turbogs_plugin.engine.base import BaseEngine
-from turbogs_plugin.engine.cuda import exposure, launches, library, training
+from turbogs_plugin.engine.cuda import launches, library, training
 from turbogs_plugin.engine.cuda.raster import (
     Buffers,
     CudaRendered,
@@ -44,7 +44,7 @@ class CudaEngine(BaseEngine):
     draw = staticmethod(training.sample_pixels)
     evaluate = staticmethod(training.sparse_loss)
     update = staticmethod(training.fused_step)
-    expose = staticmethod(exposure.expose_colors)
+    expose = staticmethod(training.expose_colors)
 
     def render(
         self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions = DEFAULT_OPTIONS
@@ -99,7 +99,7 @@ class CudaEngine(BaseEngine):
     def learn_exposures(
         self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
     ) -> Tensor:
-        return exposure.learn_exposures(exposures, colors, gradients, samples, rate, self.overflow)
+        return training.learn_exposures(exposures, colors, gradients, samples, rate, self.overflow)
 
     def settle(self, wait: bool = False) -> int:
         return 0 if self.workspace is None else self.workspace.take_lost(wait)

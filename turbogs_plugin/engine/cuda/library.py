@@ -57,7 +57,10 @@ def _interface() -> str:
 
 def _runs_on(architecture: str, capability: tuple[int, int]) -> bool:
     """Whether code of this name (``sm_90``, ``sm_90a``, PTX: ``compute_90``) runs on a GPU of this capability."""
-    kind, major, minor, kin = re.fullmatch(r"(sm|compute)_(\d+)(\d)([af]?)", architecture).groups()
+    match = re.fullmatch(r"(sm|compute)_(\d+)(\d)([af]?)", architecture)
+    if match is None:
+        return False
+    kind, major, minor, kin = match.groups()
     built = int(major), int(minor)
     if kin == "a":  # only for that GPU
         return built == capability

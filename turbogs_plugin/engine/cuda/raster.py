@@ -26,6 +26,7 @@ from turbogs_plugin.engine.render_pass import (
     Rendered,
     RenderOptions,
     ScreenRecords,
+    Upstream,
     require_statistics,
 )
 from turbogs_plugin.errors import InputError
@@ -187,23 +188,18 @@ class CudaRendered(Rendered):
             radii=self._radii.clone(),
         )
 
-    def _backward(self, upstream: dict[str, Tensor | None], with_statistics: bool) -> CudaScreenGradients:
-        if upstream["depth_gradients"] is not None and self.depths is None:
+    def _backward(self, upstream: Upstream, with_statistics: bool) -> CudaScreenGradients:
+        if upstream.depth_gradients is not None and self.depths is None:
             raise InputError("depth_gradients need a pass with depths: rasterize(..., with_depth=True)")
-        for name, value in upstream.items():
+        for name, value in vars(upstream).items():
             like = self.colors if name == "color_gradients" else self.alphas
             if value is not None and (value.shape, value.dtype, value.device) != (like.shape, like.dtype, like.device):
                 wanted = f"float32 {list(like.shape)} on {like.device}"
                 raise InputError(f"{name} must be {wanted}, got {value.dtype} {list(value.shape)} on {value.device}")
-        ready = {name: None if value is None else value.contiguous() for name, value in upstream.items()}
-        instances = len(self._forward.instances)
-        records = Buffers(self._workspace, self.colors.device).floats("records", instances, ScreenRecord.SIZE)
+        buffers = Buffers(self._workspace, self.colors.device)
+        records = buffers.floats("records", len(self._forward.instances), ScreenRecord.SIZE)
         backward = launches.RasterBackward(
-            self._forward,
-            **ready,
-            records=records,
-            with_density_sums=with_statistics,
-            cleared=self._cleared,
+            self._forward, upstream.contiguous(), records, with_density_sums=with_statistics, cleared=self._cleared
         )
         library.launch(backward)
         self._cleared = False
@@ -292,36 +288,25 @@ class _Front:
         return cls(splats, tiles, tiles.status[:1], block_sums, records)
 
 
-@dataclass(frozen=True)
-class _Back:
-    """Buffers of the intersections and of the forward pass."""
+def _intersection_arrays(buffers: Buffers, capacity: int) -> launches.Intersections:
+    return launches.Intersections(
+        intersection_keys=buffers.integers("intersection_keys", capacity, dtype=torch.int64),
+        intersection_ids=buffers.integers("intersection_ids", capacity),
+        runs=buffers.integers("runs", capacity // (layout.SORT_RUN // 2), 2),
+    )
 
-    intersection_keys: Tensor
-    intersection_ids: Tensor
-    runs: Tensor
-    colors: Tensor
-    alphas: Tensor
-    transmittances: Tensor
-    last_intersections: Tensor
-    masks: Tensor
-    bucket_counts: Tensor
-    chunks: int
 
-    @classmethod
-    def of(cls, buffers: Buffers, capacity: int, slots: int, num_active: int) -> _Back:
-        chunks = warps_per_tile(slots, num_active)
-        return cls(
-            intersection_keys=buffers.integers("intersection_keys", capacity, dtype=torch.int64),
-            intersection_ids=buffers.integers("intersection_ids", capacity),
-            runs=buffers.integers("runs", capacity // (layout.SORT_RUN // 2), 2),
-            colors=buffers.floats("colors", slots, 3),
-            alphas=buffers.floats("alphas", slots),
-            transmittances=buffers.floats("transmittances", slots),
-            last_intersections=buffers.integers("last_intersections", slots),
-            masks=buffers.integers("masks", (capacity // layout.BUCKET + num_active + 1) * chunks),
-            bucket_counts=buffers.integers("bucket_counts", num_active * chunks),
-            chunks=chunks,
-        )
+def _pixel_arrays(buffers: Buffers, capacity: int, slots: int, num_active: int) -> launches.PixelArrays:
+    chunks = warps_per_tile(slots, num_active)
+    return launches.PixelArrays(
+        colors=buffers.floats("colors", slots, 3),
+        alphas=buffers.floats("alphas", slots),
+        transmittances=buffers.floats("transmittances", slots),
+        last_intersections=buffers.integers("last_intersections", slots),
+        masks=buffers.integers("masks", (capacity // layout.BUCKET + num_active + 1) * chunks),
+        bucket_counts=buffers.integers("bucket_counts", num_active * chunks),
+        chunks=chunks,
+    )
 
 
 def rasterize_cuda(
@@ -362,15 +347,14 @@ def rasterize_cuda(
     most = layout.INTERSECTIONS_MAX if capacity is None else capacity
     library.launch(launches.RasterCountIntersections(tiles, front.block_sums, most))
     if capacity is None:
-        intersections = int(tiles.status[0])
-        require_possible(intersections)
-        capacity = round_capacity(intersections)
+        found = int(tiles.status[0])
+        require_possible(found)
+        capacity = round_capacity(found)
         if workspace is not None:
-            workspace.learn(intersections, num_active)
+            workspace.learn(found, num_active)
 
-    back = buffers.kept("back", _Back.of, capacity, slots, num_active)
-    keys, ids = back.intersection_keys, back.intersection_ids
-    library.launch(launches.RasterSortIntersections(splats, tiles, keys, ids, back.runs))
+    intersections = buffers.kept("intersections", _intersection_arrays, capacity)
+    library.launch(launches.RasterSortIntersections(splats, tiles, intersections))
     if workspace is not None:
         workspace.send_count(num_active)
 
@@ -380,23 +364,17 @@ def rasterize_cuda(
         tile_offsets=samples.tile_offsets.contiguous(),
         pixel_ids=samples.pixel_ids.contiguous(),
         tile_starts=tiles.tile_starts,
-        intersection_ids=ids,
+        intersection_ids=intersections.intersection_ids,
         instances=splats.instances,
-        colors=back.colors,
-        alphas=back.alphas,
-        transmittances=back.transmittances,
+        pixels=buffers.kept("pixels", _pixel_arrays, capacity, slots, num_active),
         depths=torch.empty(slots, device=device) if options.with_depth else None,
-        last_intersections=back.last_intersections,
-        masks=back.masks,
-        bucket_counts=back.bucket_counts,
-        chunks=back.chunks,
         settings=settings,
         background=launches.Background(*options.background),
     )
     library.launch(forward)
     return CudaRendered(
-        forward.colors,
-        forward.alphas,
+        forward.pixels.colors,
+        forward.pixels.alphas,
         forward.depths,
         num_intersections=front.num_intersections,
         _scene=scene,

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import threshold_
 
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.intersection import Intersections
@@ -143,13 +142,13 @@ def composite_slice(
     dx, dy = fields[0] - centers[:, :, :1], fields[1] - centers[:, :, 1:]
     sigma = (0.5 * c * dy).mul_(dy)
     sigma.addcmul_((0.5 * a * dx).addcmul_(b.expand_as(dx), dy), dx)
-    threshold_(sigma, -torch.finfo(sigma.dtype).tiny, torch.finfo(sigma.dtype).max / 4)  # negative: skipped
+    torch.threshold_(sigma, -torch.finfo(sigma.dtype).tiny, torch.finfo(sigma.dtype).max / 4)  # negative: skipped
     alpha = sigma.neg().exp_().mul_(opacities)
     clamped = alpha > settings.alpha_max if bool((opacities > settings.alpha_max).any()) else None
     if clamped is not None:
         alpha.clamp_(max=settings.alpha_max)
     at_least = torch.nextafter(alpha.new_tensor(settings.alpha_min), alpha.new_tensor(0.0)).item()
-    threshold_(alpha, at_least, 0.0)
+    torch.threshold_(alpha, at_least, 0.0)
 
     through = torch.empty(count, centers.shape[1], splats + 1, dtype=alpha.dtype, device=alpha.device)
     through[:, :, :1] = transmittance
@@ -161,7 +160,7 @@ def composite_slice(
         ended = through[:, :, 1:] <= settings.transmittance_min
         weights.masked_fill_(ended, 0)
         alpha.masked_fill_(ended, 0)
-        threshold_(behind, settings.transmittance_min, 0.0)
+        torch.threshold_(behind, settings.transmittance_min, 0.0)
     return Slice(features, conics, opacities, dx, dy, sigma, alpha, clamped, weights, behind)
 
 

@@ -131,8 +131,8 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
     return drawn, torch.where(complete, 1.0, 1.0 - missed)
 
 
-def _importance_weights(probabilities: Tensor | None, rule: DrawRule) -> Tensor | None:
-    return None if probabilities is None else probabilities.clamp(min=2.0**-24) ** -rule.importance
+def _importance_weights(probabilities: Tensor, rule: DrawRule) -> Tensor:
+    return probabilities.clamp(min=2.0**-24) ** -rule.importance
 
 
 def _share(values: Tensor, sums: Tensor) -> Tensor:
@@ -200,7 +200,7 @@ def _draw_pixels(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
     wanted = rule.wanted(rate, TILE_PIXELS)
     words = batch.words(batch.table, PURPOSE_PIXELS)
     drawn, probabilities = draw_units(Units(batch.errors, batch.ages, batch.exist, words, wanted), rule)
-    weights = _importance_weights(probabilities, rule)
+    weights = None if probabilities is None else _importance_weights(probabilities, rule)
     if batch.live_tiles is None:
         slots = slots_of_tiles(wanted, batch.sizes)
         tile_ids, full = torch.arange(len(batch.table), dtype=torch.int32, device=batch.table.device), True
@@ -223,12 +223,13 @@ def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
         wanted = rule.wanted(rate, end - first)
         numbers.append(wanted)
         exist = torch.ones(1, end - first, dtype=torch.bool, device=device)
-        of_row = tuple(word[row].T for word in words)
-        drawn, probabilities = draw_units(Units(errors[None, row], ages[None, row], exist, of_row, wanted), rule)
+        x0, x1, x2, x3 = (word[row].T for word in words)
+        units = Units(errors[None, row], ages[None, row], exist, (x0, x1, x2, x3), wanted)
+        drawn, probabilities = draw_units(units, rule)
         # Their number is known here; a boolean index would wait for the device.
         tile_ids = torch.argsort(drawn[0].to(torch.int8), stable=True, descending=True)[:wanted]
         chosen.append(first + tile_ids)
-        if rule.importance:
+        if probabilities is not None:
             weights.append(_importance_weights(probabilities, rule)[0, tile_ids])
     tile_ids = torch.cat(chosen)
     table, exist = batch.table[tile_ids], batch.exist[tile_ids]

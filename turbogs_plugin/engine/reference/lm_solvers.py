@@ -8,8 +8,7 @@ For the blocks of Moment-LM (D = 10 and 4) `reference/update.py` uses `solve_low
 (`csrc/optimizer/moment_lm.cuh`) does what `solve_scaled_cholesky` does. Both first scale the system by d^(-1/2) on both
 sides. It becomes I + (something positive semi-definite), whose eigenvalues are >= 1. Its condition depends only on the
 length of the scaled rows, which can be bounded. Entries of d of very different sizes do not harm Cholesky. Damping lost
-in rounding beside long rows does, and so do squares that overflow; the scaled form has neither. `solve_raw_cholesky`
-shows what happens without scaling, `solve_float64` is the yardstick. Both are there for the table of docs/numerics.md.
+in rounding beside long rows does, and so do squares that overflow; the scaled form has neither.
 """
 
 from __future__ import annotations
@@ -51,20 +50,6 @@ def solve_low_rank(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) 
     projected = torch.einsum("kni,ni->kn", scaled, scaled_rhs)
     coefficients = _solve_identity_plus(gram, projected)  # [K, n]
     return scale * (scaled_rhs - torch.einsum("kn,kni->ni", coefficients, scaled))
-
-
-def solve_raw_cholesky(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
-    """Cholesky of the system as printed in the paper, unscaled. For comparison only: if a pivot fails, or products
-    overflow, the result is NaN."""
-    matrix = torch.einsum("kn,kni,knj->nij", weights, rows, rows) + torch.diag_embed(damping)
-    factor, failed = torch.linalg.cholesky_ex(matrix)
-    solution = torch.cholesky_solve(rhs.unsqueeze(-1), factor).squeeze(-1)
-    return torch.where((failed == 0).unsqueeze(-1), solution, torch.nan)
-
-
-def solve_float64(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
-    """`solve_scaled_cholesky` in float64 throughout. For comparison; the result is float64."""
-    return solve_scaled_cholesky(rows.double(), weights.double(), damping.double(), rhs.double())
 
 
 def _solve_identity_plus(matrix: Tensor, rhs: Tensor) -> Tensor:

@@ -22,8 +22,9 @@ and never 0 or 1. (With 24 random bits it would need 25 bits, and could round to
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,12 +48,9 @@ _BLOCK = 64
 """The host's words are made for this many iterations at once, which costs numpy the same as for one."""
 
 Words = tuple[Tensor, Tensor, Tensor, Tensor]
-Array = TypeVar("Array", Tensor, np.ndarray)
 
 
-def philox4x32(
-    counter: tuple[Array, int | Array, int | Array, int | Array], key: tuple[int | Array, int | Array]
-) -> tuple[Array, Array, Array, Array]:
+def philox4x32(counter: Iterable[Any], key: tuple[Any, Any]) -> tuple[Any, Any, Any, Any]:
     """Philox4x32-10.
 
     Args:

@@ -10,8 +10,8 @@ from torch import Tensor
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference import compositing
 from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Compositor
-from turbogs_plugin.engine.reference.dropout import kept
 from turbogs_plugin.engine.reference.intersection import intersect_tiles
+from turbogs_plugin.engine.reference.philox import PURPOSE_DROPOUT, random_words
 from turbogs_plugin.engine.reference.projection import Rows, Splats, drawable_rows, project_rows
 from turbogs_plugin.engine.render_pass import (
     DEFAULT_OPTIONS,
@@ -19,8 +19,10 @@ from turbogs_plugin.engine.render_pass import (
     Rendered,
     RenderOptions,
     ScreenRecords,
+    Upstream,
     require_statistics,
 )
+from turbogs_plugin.engine.rules import Dropout
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 
@@ -119,9 +121,9 @@ class ReferenceRendered(Rendered):
         return Projected(**{each.name: placed(getattr(self._splats, each.name)) for each in fields(Projected)})
 
     @torch.no_grad()
-    def _backward(self, upstream: dict[str, Tensor | None], with_statistics: bool) -> ReferenceScreenGradients:
+    def _backward(self, upstream: Upstream, with_statistics: bool) -> ReferenceScreenGradients:
         zeros = torch.zeros_like(self.alphas)
-        given = {name: zeros if value is None else value for name, value in upstream.items()}
+        given = {name: zeros if value is None else value for name, value in vars(upstream).items()}
         # The expected depth is a quotient of two of the sums.
         alphas = self._sums[:, 3].clamp(min=ALPHA_TINY)
         divided = given["depth_gradients"] / alphas
@@ -156,6 +158,17 @@ def rasterize_reference(
             background = sums.new_tensor(options.background)
             colors = colors + (1.0 - sums[:, 3:4]) * background
     return ReferenceRendered(colors, sums[:, 3], depths, sums, table, compositor, rows, splats, leaves, background)
+
+
+def kept(dropout: Dropout, count: int, device: torch.device) -> Tensor | None:
+    """[N] bool, the Gaussians that are not left out: row n is one if word 0 of place n is not below the threshold.
+
+    None where all stay.
+    """
+    if dropout.threshold == 0:
+        return None
+    rows = torch.arange(count, device=device)
+    return random_words(rows, 0, PURPOSE_DROPOUT, dropout.seed, dropout.iteration)[0] >= dropout.threshold
 
 
 def screen_gradients(

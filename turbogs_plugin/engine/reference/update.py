@@ -15,7 +15,7 @@ from torch import Tensor
 from turbogs_plugin.engine.layout import ParameterRow
 from turbogs_plugin.engine.moments import COLUMNS, GaussianMoments
 from turbogs_plugin.engine.reference.lm_solvers import solve_low_rank
-from turbogs_plugin.engine.rules import ParameterRates, UpdateRule
+from turbogs_plugin.engine.rules import MomentLMParams, ParameterRates, UpdateRule
 from turbogs_plugin.types import GaussianGradients, Gaussians
 
 BLOCKS = (
@@ -56,7 +56,7 @@ def apply_update(
         if not rule.per_view:
             rows, losses = gradient[None], losses.sum(dim=0, keepdim=True)
         if rule.lm.units == "balanced":
-            delta = balanced_delta(rows, losses, terms, rule)
+            delta = balanced_delta(rows, losses, terms, rule.rates, rule.lm)
         else:
             # The printed equation: the g_k are the rows of J, and m and v have no bias correction.
             damping = torch.sqrt(moments.exp_avg_sq[index]) + rule.eps
@@ -118,7 +118,9 @@ def advance(
     return AdamTerms(mean / mean_correction, torch.sqrt(square / square_correction) + rule.eps)
 
 
-def balanced_delta(rows: Tensor, losses: Tensor, terms: AdamTerms, rule: UpdateRule) -> Tensor:
+def balanced_delta(
+    rows: Tensor, losses: Tensor, terms: AdamTerms, parameter_rates: ParameterRates, lm: MomentLMParams
+) -> Tensor:
     """[n, 14] change of the parameters by the unit-consistent form.
 
     Args:
@@ -127,16 +129,16 @@ def balanced_delta(rows: Tensor, losses: Tensor, terms: AdamTerms, rule: UpdateR
             out, as it says nothing about curvature.
         terms: from the bias-corrected moments, [n, 14].
     """
-    rates = packed_rates(rule.rates, rows)
+    rates = packed_rates(parameter_rates, rows)
     adam = terms.delta(rates)
     has_share = (losses > 0) & torch.isfinite(losses)
     largest = torch.finfo(rows.dtype).max
-    weights = torch.where(has_share, (rule.lm.curvature / losses).clamp(max=largest), 0.0).to(rows.dtype)
+    weights = torch.where(has_share, (lm.curvature / losses).clamp(max=largest), 0.0).to(rows.dtype)
     # A rate of zero fixes its parameter, even against coupling: its damping divides by the root of the smallest float.
     damping = terms.denominator / rates.clamp(min=torch.finfo(rows.dtype).tiny ** 0.5)
     delta = _solve(rows, weights, damping, terms.mean)
-    if rule.lm.max_step > 0:
-        bound = torch.maximum(rule.lm.max_step * rates, adam.abs())
+    if lm.max_step > 0:
+        bound = torch.maximum(lm.max_step * rates, adam.abs())
         delta = torch.maximum(torch.minimum(delta, bound), -bound)
     # Without rows the solution is Adam's step; taking Adam's makes them equal to the last bit.
     takes_solution = torch.zeros_like(delta, dtype=torch.bool)

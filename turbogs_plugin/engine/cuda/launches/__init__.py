@@ -2,8 +2,8 @@
 
 `library.launch` calls an operator with four lists: the tensors, integers, reals and rows of views of the launch. Each
 list is in the order of the fields; those of a nested class stand in its place. The build writes the same order into a
-C++ header (csrc/generate_headers.py). So no order is written down twice, and these files must not import torch, nor
-anything of the package but each other.
+C++ header (csrc/generate_headers.py). So no order is written down twice, and when they run these files import neither
+torch nor anything of the package but each other.
 
 Letters in shapes: K views, N Gaussians, T tiles with samples, P sample slots, M the most intersections of tiles and
 splats, B harmonics above band 0, X flat pixels, V training views and C cameras. An instance is a Gaussian in a view,
@@ -12,85 +12,350 @@ its row k * N + n. All tensors are contiguous and on one CUDA device. Where a te
 
 from __future__ import annotations
 
-from .base import LAUNCHES, Launch, annotations, nested_type
-from .common import (
-    NO_STATS,
-    GaussianArrays,
-    GridOrigin,
-    SampleArrays,
-    Scene,
-    ScreenBackward,
-    Splats,
-    StatSums,
-    TileLists,
-)
-from .optimizer import NO_COPIES, Copies, FusedStep, Moments, ProjectionBackward, Rates
-from .peers import CollectRecords, GatherColors, Peers, Sources
-from .raster import (
-    Background,
-    RasterBackward,
-    RasterCountIntersections,
-    RasterForward,
-    RasterProject,
-    RasterSortIntersections,
-)
-from .training import (
-    NO_MAPS,
-    NO_MASKS,
-    NO_SCRATCH,
-    CountFilled,
-    ExposeColors,
-    ExposureArrays,
-    ExposureBackward,
-    ExposureStep,
-    LossSettings,
-    MapArrays,
-    SamplePixels,
-    SparseLoss,
-    TileScratch,
-)
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "LAUNCHES",
-    "NO_COPIES",
-    "NO_MAPS",
-    "NO_MASKS",
-    "NO_SCRATCH",
-    "NO_STATS",
-    "Background",
-    "CollectRecords",
-    "Copies",
-    "CountFilled",
-    "ExposeColors",
-    "ExposureArrays",
-    "ExposureBackward",
-    "ExposureStep",
-    "FusedStep",
-    "GatherColors",
-    "GaussianArrays",
-    "GridOrigin",
-    "Launch",
-    "LossSettings",
-    "MapArrays",
-    "Moments",
-    "Peers",
-    "ProjectionBackward",
-    "RasterBackward",
-    "RasterCountIntersections",
-    "RasterForward",
-    "RasterProject",
-    "RasterSortIntersections",
-    "Rates",
-    "SampleArrays",
-    "SamplePixels",
-    "Scene",
-    "ScreenBackward",
-    "Sources",
-    "SparseLoss",
-    "Splats",
-    "StatSums",
-    "TileLists",
-    "TileScratch",
-    "annotations",
-    "nested_type",
-]
+from .base import LAUNCHES, Launch, field_types, fields_of, nested_type
+from .peers import CollectRecords, GatherColors, Peers, Sources
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from turbogs_plugin.engine.exposures import Exposures as ExposureArrays
+    from turbogs_plugin.engine.moments import GaussianMoments as Moments
+    from turbogs_plugin.engine.render_pass import RasterSettings as BlendSettings
+    from turbogs_plugin.engine.render_pass import RasterSettings as ProjectionSettings
+    from turbogs_plugin.engine.render_pass import Upstream
+    from turbogs_plugin.engine.rules import Dropout as DropoutWords
+    from turbogs_plugin.engine.rules import LossTerms as LossSettings
+    from turbogs_plugin.engine.rules import ParameterRates as Rates
+    from turbogs_plugin.error_maps import ErrorMaps as MapArrays
+    from turbogs_plugin.masks import PixelMasks as MaskArrays
+    from turbogs_plugin.types import Gaussians as GaussianArrays
+    from turbogs_plugin.types import GaussianStats as StatSums
+    from turbogs_plugin.types import PixelSamples as SampleArrays
+else:  # the fields that launches read of these
+    GaussianArrays = fields_of(Tensor="means quats scales opacities sh0 shN")  # quats and shN 16-byte aligned
+    StatSums = fields_of(  # [N] float32 each
+        Tensor="error_sums distance_sums weight_sums grad_sums absgrad_sums square_sums view_counts max_radii"
+    )
+    SampleArrays = fields_of(Tensor="pixel_ids tile_ids tile_offsets weights")  # int32; weights float32 or None
+    ProjectionSettings = fields_of(float="near_plane far_plane alpha_min")
+    BlendSettings = fields_of(float="alpha_min alpha_max transmittance_min")
+    DropoutWords = fields_of(int="threshold seed iteration")
+    Upstream = fields_of(Tensor="color_gradients alpha_gradients depth_gradients pixel_errors")
+    Moments = fields_of(Tensor="exp_avg exp_avg_sq exp_avg_shN exp_avg_sq_shN steps skipped")
+    Rates = fields_of(float="means quats scales opacities sh0 shN")
+    MaskArrays = fields_of(Tensor="tiles rows bits")  # [L] int32, [L] int32, [B, 8] int32
+    LossSettings = fields_of(float="epsilon l1_weight structure_weight variance_constant", bool="balance")
+    MapArrays = fields_of(Tensor="errors stamps view_sums")  # [X] float16, [X] int16, [V] float64
+    ExposureArrays = fields_of(Tensor="offsets exp_avg exp_avg_sq steps")
+
+__all__ = ["LAUNCHES", "CollectRecords", "GatherColors", "Launch", "Peers", "Sources", "field_types", "nested_type"]
+
+NO_STATS: Any = SimpleNamespace(**dict.fromkeys(StatSums.__annotations__))
+NO_MASKS: Any = SimpleNamespace(**dict.fromkeys(MaskArrays.__annotations__))
+NO_MAPS: Any = SimpleNamespace(**dict.fromkeys(MapArrays.__annotations__))
+"""Arguments of a launch that adds to no statistics, counts every pixel, updates no maps."""
+
+
+@dataclass
+class Scene:
+    """The Gaussians and the views of a batch."""
+
+    gaussians: GaussianArrays
+    viewmats: Tensor  # [C, 4, 4] float32, of the capture's cameras or of those of the views alone
+    Ks: Tensor  # [C, 3, 3] float32
+    images: list[int]  # [K] layout.ImageRow
+    sh_degree: int  # to evaluate
+    eps2d: float
+
+
+@dataclass
+class GridOrigin:
+    """`PixelSamples.origin`."""
+
+    origin_x: int
+    origin_y: int
+
+
+@dataclass
+class Splats:
+    """The results of the projection, for the later stages."""
+
+    cameras: Tensor  # [K, 32] float32, layout.CameraRow
+    instances: Tensor  # [K * N, 12] float32, layout.InstanceRow; nothing where off screen
+    radii: Tensor  # [K, N, 2] int32, zero where off screen
+    active_prefix: Tensor | None  # [tiles + 1] int32, number of tiles with samples of a smaller id; None: all have some
+
+
+@dataclass
+class TileLists:
+    """Where the intersections of each tile lie, and how many there are."""
+
+    tile_cursors: Tensor  # [T + 1] int32, before the count: differences of the tiles' counts
+    tile_starts: Tensor  # [T + 1] int32
+    status: Tensor  # [2] int32, `Workspace.status`
+    counters: Tensor  # [2] int32
+
+
+@dataclass
+class ScreenBackward:
+    """Gradients on the screen, and what is needed to take them to the parameters."""
+
+    scene: Scene
+    records: Tensor  # [K, N, 16] float32, layout.ScreenRecord; anything where off screen
+    radii: Tensor  # [K, N, 2] int32
+    stats: StatSums  # the launch adds to them
+    num_filled: Tensor | None  # [1] int32; None where all slots are filled
+    num_slots: int  # P
+    overflow: Tensor | None  # [1] int32; if not 0, the launch does nothing
+
+
+@dataclass
+class RasterProject(Launch):
+    """Stage 1: project `scene`. Writes `splats` and `tile_cursors`, and clears the records of splats on screen."""
+
+    scene: Scene
+    grid: GridOrigin
+    settings: ProjectionSettings
+    dropout: DropoutWords
+    splats: Splats
+    tile_ids: Tensor | None  # [T] int32; None where all tiles have samples
+    tile_cursors: Tensor  # [T + 1] int32
+    records: Tensor | None  # [K * N, 16] float32
+
+
+@dataclass
+class RasterCountIntersections(Launch):
+    """Stage 2: where the intersections of each tile begin. Sets the flag `status[1]` if there are too many."""
+
+    tiles: TileLists
+    block_sums: Tensor  # [ceil(T / SCAN_TILES), 2] int64 scratch
+    capacity: int  # M
+
+
+@dataclass
+class Intersections:
+    """The M intersections of a pass, tile after tile, and memory to sort them in."""
+
+    intersection_keys: Tensor  # [M] int64 scratch
+    intersection_ids: Tensor  # [M] int32: the instance of each
+    runs: Tensor  # [M / (SORT_RUN / 2), 2] int32 scratch
+
+
+@dataclass
+class RasterSortIntersections(Launch):
+    """Stages 3 and 4: the intersections of each tile, sorted by depth."""
+
+    splats: Splats
+    tiles: TileLists
+    intersections: Intersections
+
+
+@dataclass
+class Background:
+    """The colour that shows through, 0 .. 1."""
+
+    background_red: float
+    background_green: float
+    background_blue: float
+
+
+@dataclass
+class PixelArrays:
+    """What the forward pass leaves of each sample, and for the backward pass."""
+
+    colors: Tensor  # [P, 3] float32
+    alphas: Tensor  # [P] float32
+    transmittances: Tensor  # [P] float32
+    last_intersections: Tensor  # [P] int32
+    masks: Tensor  # [(M / BUCKET + T + 1) * chunks] int32
+    bucket_counts: Tensor  # [T * chunks] int32
+    chunks: int  # work items of a tile
+
+
+@dataclass
+class RasterForward(Launch):
+    """Stage 5: colours, alphas and, if asked for, depths at the samples."""
+
+    cameras: Tensor  # of `Splats`
+    tile_ids: Tensor | None  # [T] int32; None where all tiles have samples
+    tile_offsets: Tensor  # [T + 1] int32
+    pixel_ids: Tensor  # [P] int32
+    tile_starts: Tensor  # [T + 1] int32
+    intersection_ids: Tensor  # [M] int32
+    instances: Tensor  # of `Splats`
+    pixels: PixelArrays
+    depths: Tensor | None  # [P] float32
+    settings: BlendSettings
+    background: Background
+
+
+@dataclass
+class RasterBackward(Launch):
+    """Stage 6: the gradients on the screen, as records, with the sums for density control."""
+
+    forward: RasterForward  # that of the pass
+    upstream: Upstream  # [P, 3] and [P] float32; depth gradients only of a pass with depths
+    records: Tensor  # [K * N, 16] float32
+    with_density_sums: bool  # fill the columns that only density control asks for
+    cleared: bool  # the records on screen are zero already
+
+
+@dataclass
+class ProjectionBackward(Launch):
+    """Gradients of the parameters: a row for each view, or their sum. Every entry is written."""
+
+    screen: ScreenBackward
+    rows: Tensor  # [K or 1, N, 14] float32, layout.ParameterRow
+    shN_gradients: Tensor  # [N, B, 3] float32
+    touched: Tensor  # [N] bool
+    view_losses: Tensor  # [K or 1, N] float32
+
+
+@dataclass
+class Copies:
+    """How many bytes behind each parameter a copy of it lies, maybe in another GPU's memory; 0: no copy."""
+
+    copy_0: int
+    copy_1: int
+    copy_2: int
+    copy_3: int
+    copy_4: int
+    copy_5: int
+    copy_6: int
+
+
+NO_COPIES = Copies(*(0,) * 7)
+
+
+@dataclass
+class FusedStep(Launch):
+    """Projection backward and one step of the optimizer, in place on Gaussians and moments, and on copies of the
+    Gaussians."""
+
+    screen: ScreenBackward
+    copies: Copies
+    moments: Moments
+    kind: int  # of layout.UPDATE_KINDS
+    rows_per_view: bool
+    rates: Rates
+    beta1: float
+    beta2: float
+    eps: float
+    curvature: float
+    max_step: float
+
+
+@dataclass
+class TileScratch:
+    """Scratch for unit = tile: an entry for each tile of the batch."""
+
+    tile_errors: Tensor | None  # float64
+    tile_ages: Tensor | None  # int32
+    tile_keys: Tensor | None  # int64
+    tile_missed: Tensor | None  # float32
+
+
+NO_SCRATCH = TileScratch(None, None, None, None)
+"""For single pixels."""
+
+
+@dataclass
+class SamplePixels(Launch):
+    """Draw samples: writes `pixel_ids`, `tile_ids`, `tile_offsets` and `weights`."""
+
+    errors: Tensor  # [X] float16
+    stamps: Tensor  # [X] int16
+    views: list[int]  # [K] layout.DrawRow
+    grid: GridOrigin
+    unit: int  # of layout.UNITS
+    masks: MaskArrays
+    slots_per_tile: int  # slots of a tile that the image's edge does not cut; with masks, of every tile
+    mixed_uniform: bool
+    importance: float
+    seed: int
+    iteration: int
+    now: int  # a stamp's age is `now` less the stamp
+    pixel_ids: Tensor  # [P] int32
+    tile_ids: Tensor  # [T] int32
+    tile_offsets: Tensor  # [T + 1] int32
+    weights: Tensor | None  # [P] float32; None without importance
+    scratch: TileScratch
+
+
+@dataclass
+class CountFilled(Launch):
+    """Add the number of filled slots to `num_filled`."""
+
+    pixel_ids: Tensor  # [P] int32
+    num_filled: Tensor  # [1] int32
+
+
+@dataclass
+class SparseLoss(Launch):
+    """Compute the loss with its gradient and errors, and update the maps."""
+
+    colors: Tensor  # [P, 3] float32
+    targets: Tensor | None  # [P, 3] float32
+    photos: Tensor | None  # [X, 3 or 4] uint8, from which to gather the colours; instead of `targets`
+    samples: SampleArrays
+    views: list[int]  # [K] layout.ViewRow
+    grid: GridOrigin
+    structure: int  # of layout.STRUCTURES
+    terms: LossSettings
+    maps: MapArrays
+    beta: float  # EMA weight of a new error
+    stamp: int  # for the pixels visited
+    num_filled: Tensor | None  # [1] int32; None where all slots are filled
+    loss: Tensor  # [] float64, zero
+    color_gradients: Tensor  # [P, 3] float32
+    pixel_errors: Tensor  # [P] float32
+    nonfinite_losses: Tensor | None  # [] int64, 1 is added if the loss is not finite
+    overflow: Tensor | None  # [1] int32; if not 0, the maps stay as they are
+    background: Background  # shows through photos with an alpha
+
+
+@dataclass
+class ExposedViews:
+    """Rendered colours, and the exposures of their photos."""
+
+    colors: Tensor  # [P, 3] float32
+    tile_ids: Tensor  # [T] int32
+    tile_offsets: Tensor  # [T + 1] int32
+    views: list[int]  # [K] layout.ViewRow
+    grid: GridOrigin
+    offsets: Tensor  # [V, 3, 4] float32
+
+
+@dataclass
+class ExposeColors(ExposedViews, Launch):
+    """Map the colours by the exposures: writes `exposed`."""
+
+    exposed: Tensor  # [P, 3] float32
+
+
+@dataclass
+class ExposureBackward(ExposedViews, Launch):
+    """Gradients through `ExposeColors`: changes `gradients` in place, adds to `sums`."""
+
+    gradients: Tensor  # [P, 3] float32
+    sums: Tensor  # [K, 3, 4] float64, zero
+
+
+@dataclass
+class ExposureStep(Launch):
+    """One step of Adam for the photos of a batch, in place; then the mean of all offsets is zero."""
+
+    sums: Tensor  # [K, 3, 4] float64
+    views: list[int]  # [K] layout.ViewRow
+    grid: GridOrigin
+    exposures: ExposureArrays
+    overflow: Tensor | None  # [1] int32; if not 0, the launch does nothing
+    rate: float
+    beta1: float
+    beta2: float
+    eps: float
+    pull: float
