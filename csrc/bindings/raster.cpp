@@ -1,6 +1,6 @@
 // The kernels of the rasterizer as torch operators; see arguments.h.
 #include "bindings/arguments.h"
-#include "bindings/scene.h"
+#include "bindings/views.h"
 #include "raster/raster_params.h"
 
 namespace turbogs {

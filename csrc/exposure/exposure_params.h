@@ -7,8 +7,8 @@
 
 #include <cstdint>
 
-#include "common/sample_view.h"
 #include "common/sizes.h"
+#include "common/views.h"
 
 namespace turbogs {
 

@@ -8,8 +8,7 @@
 // tile stays in shared memory: a sample's colour and truth are read once, its gradient is read and written once.
 #include "common/tiles.cuh"
 #include "common/warp.cuh"
-#include "loss/sample_truth.cuh"
-#include "loss/tile_similarity.cuh"
+#include "loss/sample_loss.cuh"
 
 namespace turbogs {
 namespace {

@@ -6,8 +6,8 @@
 
 #include <cstdint>
 
-#include "common/scene_params.h"
 #include "common/sizes.h"
+#include "common/views.h"
 
 namespace turbogs {
 

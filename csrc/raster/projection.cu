@@ -7,7 +7,7 @@
 // queue, from which all threads together take them to find their colours and tiles, and to clear their records where
 // a backward pass will add to them: what is off screen has no record. Active tiles of a row of tiles have consecutive
 // positions, found by their prefix counts, so a splat is counted by two additions a row, whatever its length.
-#include "common/philox.cuh"
+#include "common/philox.h"
 #include "common/spherical_harmonics.cuh"
 #include "common/splat_geometry.cuh"
 #include "common/tiles.cuh"

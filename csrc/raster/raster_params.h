@@ -14,8 +14,8 @@
 
 #include "common/camera.cuh"
 #include "common/philox.h"
-#include "common/scene_params.h"
 #include "common/sizes.h"
+#include "common/views.h"
 
 namespace turbogs {
 

@@ -7,7 +7,7 @@
 #pragma once
 
 #include "common/approximate_math.cuh"
-#include "common/philox.cuh"
+#include "common/philox.h"
 #include "sampling/sampling_params.h"
 
 namespace turbogs {

@@ -7,8 +7,8 @@
 #include <cstdint>
 
 #include "common/philox.h"
-#include "common/sample_view.h"
 #include "common/sizes.h"
+#include "common/views.h"
 
 namespace turbogs {
 

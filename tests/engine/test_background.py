@@ -21,6 +21,7 @@ def case():
 def test_colors_are_over_the_background(case):
     plain, shown = rasterize(*case), rasterize(*case, background=COLOR)
     assert torch.equal(plain.alphas, shown.alphas)
+    assert torch.equal(rasterize(*case, background=BLACK).colors, plain.colors)
     expected = plain.colors + (1 - plain.alphas[:, None]) * torch.tensor(COLOR, dtype=torch.float64)
     torch.testing.assert_close(shown.colors, expected, rtol=0, atol=1e-15)
     empty = shown.colors[~case[2].filled].unique(dim=0)
@@ -30,10 +31,6 @@ def test_colors_are_over_the_background(case):
         render_image(gaussians, cameras, 1, background=COLOR).colors.amin()
         > render_image(gaussians, cameras, 1).colors.amin()
     )
-
-
-def test_black_is_as_without_a_background(case):
-    assert torch.equal(rasterize(*case, background=BLACK).colors, rasterize(*case).colors)
 
 
 def test_gradients_are_those_of_the_sum_written_out(case):

@@ -1,9 +1,10 @@
-"""The boundary between Python and the kernels, without a GPU: orders of fields, layouts, other builds."""
+"""The boundary between Python and the kernels, without a GPU: orders of fields, layouts, other builds, the choice."""
 
 import dataclasses
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,11 +13,13 @@ import pytest
 import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
+from turbogs_plugin import engine
 from turbogs_plugin.engine import layout
 from turbogs_plugin.engine.cuda import launches, library, raster
 from turbogs_plugin.engine.cuda.training import view_rows
 from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
+from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.rules import LossTerms, ParameterRates
 from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, PixelSamples
 
@@ -203,3 +206,16 @@ def test_the_interface_changes_with_every_order_and_size(monkeypatch):
     monkeypatch.undo()
     monkeypatch.setattr(launches, "LAUNCHES", launches.LAUNCHES[1:])
     assert layout.interface(launches.LAUNCHES) != present
+
+
+def test_a_gpu_without_kernels_is_named_and_gets_the_reference(monkeypatch):
+    """A training by the reference on a GPU looks like one that hangs."""
+    monkeypatch.setattr(engine.library, "unavailable_reason", lambda: "_C.abi3.so is not built")
+    with pytest.warns(UserWarning, match=r"kernels are not usable \(_C\.abi3\.so is not built\)"):
+        assert isinstance(engine.engine_of(torch.device("cuda")), ReferenceEngine)
+
+
+def test_the_cpu_has_the_reference_without_a_word():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert isinstance(engine.engine_of(torch.device("cpu")), ReferenceEngine)

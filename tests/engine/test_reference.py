@@ -191,29 +191,8 @@ def test_each_view_row_is_the_gradient_of_that_view_alone():
         torch.testing.assert_close(rows.view_losses[view], expected.view_losses[0] * share)
 
 
-def test_absolute_gradients_are_summed_pixel_by_pixel():
-    """One pixel at a time the absolute gradient is the gradient's absolute value."""
-    gaussians, cameras = make_gaussians(20), make_cameras([(6, 5)])
-    samples = dense_samples(cameras)
-    colors, _, _, _ = upstream(samples)
-
-    def means_gradient(upstream_gradient):
-        output = rasterize_differentiable(leaves, cameras, samples)
-        output.colors.backward(upstream_gradient)
-        return output.means2d.grad, output.means2d.absgrad
-
-    leaves = gaussians.map(lambda value: value.clone().requires_grad_())
-    total, absolute = means_gradient(colors)
-    single = torch.stack(
-        [means_gradient(torch.where(torch.arange(len(samples))[:, None] == slot, colors, 0))[0] for slot in range(30)]
-    )
-    torch.testing.assert_close(single.sum(dim=0), total)
-    torch.testing.assert_close(single.abs().sum(dim=0), absolute)
-    assert (absolute > total.abs() + 1e-6).any()
-
-
-def test_square_sums_are_those_of_single_pixels():
-    """One pixel at a time the sum of squares is the square of (o * d loss / d o)."""
+def test_absolute_gradients_and_squares_are_those_of_single_pixels():
+    """One pixel at a time they are the gradient's absolute value, and the square of o * d loss / d o."""
     gaussians, cameras = make_gaussians(20), make_cameras([(6, 5)])
     samples = dense_samples(cameras)
     colors, _, _, errors = upstream(samples)
@@ -222,16 +201,26 @@ def test_square_sums_are_those_of_single_pixels():
         screen = rasterize(gaussians, cameras, samples).backward(color_gradients, errors, with_statistics=True)
         return screen.full_records()[0]  # [N, 16]
 
-    opacities = torch.sigmoid(gaussians.opacities)
-    single = sum(
-        (
-            opacities * record(torch.where(torch.arange(30)[:, None] == slot, colors, 0))[:, ScreenRecord.OPACITY]
-        ).square()
-        for slot in range(30)
-    )
-    squares = record(colors)[:, ScreenRecord.SQUARE_SUM]
+    whole = record(colors)
+    single = torch.stack([record(torch.where(torch.arange(30)[:, None] == slot, colors, 0)) for slot in range(30)])
+    means, absolute = single[..., ScreenRecord.MEAN], whole[:, ScreenRecord.ABSOLUTE]
+    torch.testing.assert_close(means.sum(dim=0), whole[:, ScreenRecord.MEAN])
+    torch.testing.assert_close(means.abs().sum(dim=0), absolute)
+    assert (absolute > whole[:, ScreenRecord.MEAN].abs() + 1e-6).any()
+    squares = (torch.sigmoid(gaussians.opacities) * single[..., ScreenRecord.OPACITY]).square().sum(dim=0)
     assert squares.max() > 0
-    torch.testing.assert_close(squares, single)
+    torch.testing.assert_close(whole[:, ScreenRecord.SQUARE_SUM], squares)
+
+
+def test_autograd_gives_the_gradients_of_the_screen():
+    gaussians, cameras = make_gaussians(20), make_cameras([(6, 5)])
+    samples = dense_samples(cameras)
+    colors = upstream(samples)[0]
+    output = rasterize_differentiable(gaussians.map(lambda value: value.clone().requires_grad_()), cameras, samples)
+    output.colors.backward(colors)
+    record = rasterize(gaussians, cameras, samples).backward(colors, with_statistics=True).full_records()
+    torch.testing.assert_close(output.means2d.grad, record[..., ScreenRecord.MEAN])
+    torch.testing.assert_close(output.means2d.absgrad, record[..., ScreenRecord.ABSOLUTE])
 
 
 def test_statistics_are_added_once_as_documented():
@@ -344,17 +333,18 @@ def test_lower_degrees_use_their_bands_alone(degree):
     assert (gradients.shN[:, bands:] == 0).all()
 
 
-@pytest.mark.parametrize("degree", [-1, 2])
-def test_a_degree_that_the_model_lacks_is_an_error(degree):
-    gaussians, cameras = make_gaussians(3, degree=1), make_cameras([(4, 4)])
-    with pytest.raises(ValueError, match="degrees 0 to 1"):
-        rasterize(gaussians, cameras, dense_samples(cameras), sh_degree=degree)
-
-
-@pytest.mark.parametrize("degree", [None, 3])
-def test_a_degree_that_no_engine_evaluates_is_refused_by_name(degree):
-    gaussians, cameras = make_gaussians(3, degree=4), make_cameras([(4, 4)])
-    with pytest.raises(InputError, match="of degree 4: the largest that is rendered is 3"):
+@pytest.mark.parametrize(
+    ("held", "degree", "refusal"),
+    [
+        (1, -1, "degrees 0 to 1"),
+        (1, 2, "degrees 0 to 1"),
+        (4, None, "of degree 4: the largest that is rendered is 3"),
+        (4, 3, "of degree 4: the largest that is rendered is 3"),
+    ],
+)
+def test_a_degree_that_the_model_lacks_or_no_engine_evaluates_is_refused(held, degree, refusal):
+    gaussians, cameras = make_gaussians(3, degree=held), make_cameras([(4, 4)])
+    with pytest.raises(InputError, match=refusal):
         rasterize(gaussians, cameras, dense_samples(cameras), sh_degree=degree)
 
 

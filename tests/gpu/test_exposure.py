@@ -9,7 +9,7 @@ from helpers.framework_runs import assert_iterations_wait_for_nothing, tiny_capt
 from helpers.raster_cases import GPU_ONLY
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.engine.cuda import exposure as kernels
+from turbogs_plugin.engine.cuda import training as kernels
 from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.reference.exposed_colors import expose, exposure_gradients, step_exposures
 from turbogs_plugin.tiles import dense_pixels

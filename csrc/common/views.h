@@ -1,13 +1,26 @@
-// What the projection and its backward pass read alike: the Gaussians, and the views of a batch. The parameters of both
-// begin with it, and one function of the bindings fills it (bindings/scene.h).
+// The Gaussians and the views of a batch, as kernels read them; filled by bindings/views.h.
 #pragma once
 
 #include <cuda_runtime.h>
+
+#include <cstdint>
 
 #include "common/sizes.h"
 
 namespace turbogs {
 
+// A view of a batch, as the kernels over the pixels of training views see it.
+struct SampleView {
+    int64_t pixel_base;  // first flat pixel
+    int width, height;
+    int tiles_x, tiles_y;
+    int tile_base;    // first tile in the batch's numbering
+    int origin_x, origin_y;  // pixels by which the grid of tiles begins before the image
+    int view_number;  // training view
+    int slot_base;    // sampler: first slot (unit pixel) or first chosen tile (unit tile)
+};
+
+// What the projection and its backward pass read alike: the parameters of both begin with it.
 struct SceneParams {
     int num_views;      // K
     int num_gaussians;  // N
