@@ -118,7 +118,7 @@ public:
     double real(Reals field) const { return reals_[static_cast<size_t>(field)]; }
     float number(Reals field) const { return static_cast<float>(real(field)); }
 
-    // Rows of so many numbers, one for each view of a batch.
+    // Number of rows of `size` numbers each, one for each view of a batch.
     int64_t num_rows(int size) const {
         const int64_t count = static_cast<int64_t>(rows_.size()) / size;
         STD_TORCH_CHECK(count >= 1 && count <= kMaxViews && count * size == static_cast<int64_t>(rows_.size()),
@@ -146,13 +146,13 @@ public:
                         " must start at a multiple of ", alignment, " bytes");
     }
 
-    // The same, of memory that kernels read or write 16 bytes at a time.
+    // As `set`, for memory that kernels read or write 16 bytes at a time.
     template <class T>
     void set_quads(T*& pointer, Tensors field, std::initializer_list<int64_t> shape) const {
         set(pointer, field, shape, scalar_type<std::remove_const_t<T>>(), sizeof(float4));
     }
 
-    // The same, left as it is where there is no tensor.
+    // As `set`, where there is a tensor; else the pointer stays as it is.
     template <class T>
     void set_optional(T*& pointer, Tensors field, std::initializer_list<int64_t> shape) const {
         if (has(field)) set(pointer, field, shape);

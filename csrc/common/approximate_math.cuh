@@ -40,7 +40,7 @@ __device__ __forceinline__ float approximate_rsqrt(float x) {
 // sqrt(x); of 0 it is 0. Denormal input counts.
 __device__ __forceinline__ float approximate_sqrt(float x) { TURBOGS_APPROXIMATE(__fsqrt_rn, "sqrt.approx.f32"); }
 
-// The same, faster: denormal input is zero.
+// sqrt(x), faster: denormal input is zero.
 __device__ __forceinline__ float approximate_sqrt_flushed(float x) {
     TURBOGS_APPROXIMATE(__fsqrt_rn, "sqrt.approx.ftz.f32");
 }

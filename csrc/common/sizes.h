@@ -10,7 +10,7 @@ constexpr int kTilePixels = kTileSize * kTileSize;
 constexpr int kMaxBands = (kMaxShDegree + 1) * (kMaxShDegree + 1) - 1;  // spherical harmonics above band 0
 constexpr int kRecordQuads = ScreenRecord::kSize / 4;                   // of 16 bytes
 
-// For the host: blocks of so many threads, one thread an item.
+// Blocks of a launch with one thread an item. For the host.
 inline int blocks_for(int items, int threads) { return (items + threads - 1) / threads; }
 
 // Tiles along a side of an image.

@@ -6,7 +6,7 @@
 namespace turbogs {
 
 constexpr float kShBand0 = 0.28209479177387814f;  // sqrt(1 / (4 pi))
-constexpr float kShBand1 = 0.48860251190292f;     // sqrt(3 / (4 pi)); the other factors are those of the paper
+constexpr float kShBand1 = 0.48860251190292f;     // sqrt(3 / (4 pi)); the other factors are the paper's
 
 // Calls visit(b, value) for the harmonics of the bands 1 .. degree at a unit direction; b counts from 0.
 template <class Visit>

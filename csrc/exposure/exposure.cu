@@ -52,7 +52,7 @@ __global__ void __launch_bounds__(kExposureThreads)
     }
 }
 
-// Adds the sums of all lanes to those of a view, and clears them.
+// Adds the sums of all lanes to the view's sums, and clears them.
 __device__ __forceinline__ void flush(const ExposureBackwardParams& params, int view, float (&sums)[kExposureNumbers]) {
     float mine = 0.0f;
 #pragma unroll

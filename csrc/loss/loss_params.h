@@ -24,7 +24,7 @@ struct SparseLossParams {
     float l1_weight;
     float structure_weight;   // factor of the mean over tiles and channels of 1 - S
     float variance_constant;  // ncc, printed_ncc
-    bool balance;             // lambda of the paper: structure gradients no larger than those of l1
+    bool balance;             // lambda of the paper: structure gradients no larger than l1's
 
     const int32_t* tile_ids;      // [T]
     const int32_t* tile_offsets;  // [T + 1]

@@ -19,7 +19,7 @@ struct Similarity {
     float value, at_y, at_x;
 };
 
-// The same with a luminance term, whose slope adds a constant: share * (at_y * dy - at_x * dx + constant).
+// Similarity with a luminance term, whose slope adds a constant: dS/dx = share * (at_y * dy - at_x * dx + constant).
 struct LuminanceSimilarity {
     float value, at_y, at_x, constant;
 };

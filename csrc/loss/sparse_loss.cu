@@ -168,7 +168,7 @@ __device__ __forceinline__ TileTotals tile_loss(const SparseLossParams& params, 
     float factor[3] = {}, at_y[3] = {}, at_x[3] = {};
     const auto offset_x = [&](int j, int c) { return (samples.x[j][c] - first_x[c]) - mean_x[c]; };
     const auto offset_y = [&](int j, int c) { return (samples.y[j][c] - first_y[c]) - mean_y[c]; };
-    // Of each sample again, the lane's j-th of a round.
+    // Each sample once more, the lane's j-th of a round.
     const auto visit_samples = [&](const auto& visit) {
         for (int start = first; start < end; start += kRound) {
             if (!resident) load_samples<kSlots, kAlpha>(params, view, start, end, samples);

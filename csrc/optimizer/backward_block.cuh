@@ -160,7 +160,7 @@ __device__ __forceinline__ void add_stat(float* sums, int gaussian, float value)
 __device__ __forceinline__ void add_sight(const ScreenBackwardParams& params, int gaussian, const Sight& sight) {
     if (params.view_counts == nullptr || sight.count == 0) return;
     add_stat(params.view_counts, gaussian, static_cast<float>(sight.count));
-    // Of numbers that are not negative, the bits are in order.
+    // Bits of numbers that are not negative are in the numbers' order.
     atomicMax(reinterpret_cast<int*>(params.max_radii) + gaussian, __float_as_int(sight.largest));
 }
 

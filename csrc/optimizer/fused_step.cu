@@ -72,7 +72,7 @@ struct RowCollector {
 #pragma unroll
             for (int i = 0; i < kSlotFloats; ++i) slot[i] = values[i];
         } else {
-            float4* record = records + count * step;  // no later than that of `view`, which is read already
+            float4* record = records + count * step;  // no later than `view`'s record, which is read already
 #pragma unroll
             for (int i = 0; i < kSlotFloats / 4; ++i) {
                 record[i] = make_float4(values[4 * i], values[4 * i + 1], values[4 * i + 2], values[4 * i + 3]);

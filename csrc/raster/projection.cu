@@ -115,7 +115,7 @@ __device__ __forceinline__ void count_tiles(const RasterCamera& camera, const in
     }
 }
 
-// Of four numbers: 0 times any other is not 0.
+// Whether four numbers are finite: 0 times any other is not 0.
 __device__ __forceinline__ bool all_finite(const float4& v) {
     return fmaf(0.0f, v.x, fmaf(0.0f, v.y, fmaf(0.0f, v.z, 0.0f * v.w))) == 0.0f;
 }

@@ -19,7 +19,7 @@
 
 namespace turbogs {
 
-// A tile with more than kSortRun intersections has at least so many for each of its runs, so this bounds their number.
+// A tile with more than kSortRun intersections has at least kLeastOfRun for each of its runs, so this bounds their number.
 constexpr int kLeastOfRun = kSortRun / 2;
 
 // One view as the kernels read it. Written by the projection's launcher.
@@ -70,7 +70,7 @@ struct ProjectionParams : SceneParams {
     int32_t* active_prefix;     // [num_tiles + 1] out: active tiles with a smaller id; null where every tile is active
     Instance* instances;        // [K, N] out, where the radius is not 0
     int2* radii;                // [K, N] out, 0 where off screen
-    int32_t* tile_differences;  // [T + 1] out: splats that reach each active tile, less those of the tile before it
+    int32_t* tile_differences;  // [T + 1] out: splats that reach each active tile, less the tile before it
     float4* records;            // [K, N, 4] set to zero where the radius is not 0, for stage 6; or null
 };
 

@@ -27,7 +27,7 @@ constexpr float kTwoLn2 = 1.3862943611198906f;          // d sigma = 2 ln(2) (u 
 
 template <bool kDepth>
 struct BackwardShared {
-    // As float2, those of two samples are one load of 16 bytes, and 28 warps fit an SM, not 27.
+    // As float2, two samples' values are one load of 16 bytes, and 28 warps fit an SM, not 27.
     using Others = std::conditional_t<kDepth, float4, float2>;
     float4 weights[kSplats * kExchangeStride / 4];  // [splat][sample]
     float4 slopes[kSplats * kExchangeStride / 4];   // [splat][sample]: d loss / d sigma
@@ -205,7 +205,7 @@ __device__ __forceinline__ void sum_samples(const BackwardShared<kDepth>& shared
     }
 }
 
-// From sums over u and v to the record: those of x and y, and of the conic.
+// From sums over u and v to the record's sums over x and y, and of the conic.
 __device__ __forceinline__ void make_record(const StagedSplat& own, const SplatSums& sums,
                                             float record[ScreenRecord::kSize]) {
     const float p = own.form.x, q = own.form.y, r = own.form.z;

@@ -31,7 +31,7 @@ __device__ __forceinline__ void enlarge(SampleBox& box, float2 pixel) {
     box = {fminf(box.x0, pixel.x), fmaxf(box.x1, pixel.x), fminf(box.y0, pixel.y), fmaxf(box.y1, pixel.y)};
 }
 
-// Of all lanes together.
+// The box around all lanes' boxes.
 __device__ __forceinline__ SampleBox box_of_warp(SampleBox box) {
 #pragma unroll
     for (int step = kWarpSize / 2; step > 0; step /= 2) {

@@ -33,7 +33,7 @@ __device__ __forceinline__ StagedSplat load_splat(const Instance* __restrict__ i
     return {__ldg(in), __ldg(in + 1), __ldg(in + 2)};
 }
 
-// In place: from the quads of an `Instance` to those of a staged splat. `least_level` = log2(alpha_min).
+// In place: from the quads of an `Instance` to a staged splat's. `least_level` = log2(alpha_min).
 __device__ __forceinline__ void stage_splat(StagedSplat& splat, float tile_x, float tile_y, float least_level,
                                             int intersection, uint32_t bit) {
     const float dx = splat.form.x - tile_x, dy = splat.form.y - tile_y;

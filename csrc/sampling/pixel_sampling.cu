@@ -2,7 +2,7 @@
 //
 // A lane holds eight of the tile's 256 pixels. The warp draws (warp_draw.cuh) and writes the drawn pixels in the order
 // of samples. The slots of a tile follow from the image's size alone, so nothing is counted on the host, and no warp
-// waits for another. The drawn sets equal those of the torch reference (draws.py).
+// waits for another. The drawn sets equal the torch reference's (draws.py).
 #include "sampling/tile_pixels.cuh"
 #include "sampling/warp_draw.cuh"
 

@@ -16,7 +16,7 @@ namespace turbogs {
 struct LiveTiles {
     int tile_base;  // place of the view's first, in the list of the batch
     int count;      // in the view
-    int first;      // with masks: place of the view's first among those of all training views
+    int first;      // with masks: place of the view's first among all training views' tiles
 };
 
 // turbogs_plugin/engine/reference/draws.py defines the draw, bit for bit.

@@ -133,7 +133,7 @@ __device__ __forceinline__ void write_samples(const SamplePixelsParams& params, 
     }
 }
 
-// For the host: blocks of so many warps.
+// Blocks of a launch with one warp an item. For the host.
 inline int warp_blocks(int warps) { return blocks_for(warps, kSampleThreads / kWarpSize); }
 
 }  // namespace turbogs

@@ -27,7 +27,7 @@ struct Split {
 enum class Spread { kAges, kUniform, kRace };
 
 // Divides the units with a key above 0 into the `count` largest and the rest. The threshold is searched until it parts
-// exactly so many from the rest or only equal keys are left to part. Keys are below 2^31. `guess`: of a race.
+// exactly `count` from the rest or only equal keys are left to part. Keys are below 2^31. `guess`: of a race.
 template <Spread kSpread>
 __device__ __forceinline__ Split split_largest(const uint32_t (&keys)[kPerLane], int count, uint32_t guess = 0u) {
     constexpr uint32_t kEnd = 0x7F800000u;  // the bits of infinity: no race's key

@@ -6,7 +6,7 @@ from helpers.rendering_scenes import make_cameras, make_gaussians, thin_out
 
 from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.render import dense_samples, rasterize, render_image
-from turbogs_plugin.types import BLACK, PARAMETER_NAMES
+from turbogs_plugin.types import PARAMETER_NAMES
 
 SIZES = [(37, 29), (20, 50)]
 COLOR = (0.9, 0.25, 0.5)
@@ -21,7 +21,6 @@ def case():
 def test_colors_are_over_the_background(case):
     plain, shown = rasterize(*case), rasterize(*case, background=COLOR)
     assert torch.equal(plain.alphas, shown.alphas)
-    assert torch.equal(rasterize(*case, background=BLACK).colors, plain.colors)
     expected = plain.colors + (1 - plain.alphas[:, None]) * torch.tensor(COLOR, dtype=torch.float64)
     torch.testing.assert_close(shown.colors, expected, rtol=0, atol=1e-15)
     empty = shown.colors[~case[2].filled].unique(dim=0)

@@ -8,14 +8,12 @@ import importlib
 import os
 from pathlib import Path
 
-import gsplat.strategy.default
 import pytest
 import torch
 from gsplat import DefaultStrategy, MCMCStrategy, rasterization
 from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
 from helpers.raster_cases import GPU_ONLY
 
-from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_loss, sparse_rasterization
@@ -196,39 +194,6 @@ def test_mcmc_behind_our_protocol():
     assert (torch.sigmoid(first.apply(gaussians).opacities) > 0.005).all()  # the dead ones have moved
 
 
-class Surgery:
-    """Duplications, splits and removals of one run of gsplat's, made again in another.
-
-    One Gaussian more moves all random numbers after it, so that runs of one rasterizer from one seed end up to 0.5 dB
-    apart; with the same surgery and the same random numbers in both, what is left is the rasterizers'. The other run's
-    own decisions are compared before they are overruled.
-    """
-
-    def __init__(self, monkeypatch):
-        self.masks, self.made, self.repeated, self.differing, self.chosen = [], 0, False, 0, 0
-        for name in ("duplicate", "split", "remove"):
-            monkeypatch.setattr(gsplat.strategy.default, name, self.watched(getattr(gsplat.strategy.default, name)))
-
-    def repeat(self) -> None:
-        self.made, self.repeated = 0, True
-
-    def watched(self, operation):
-        def surgery(params, optimizers, state, mask, **options):
-            if not self.repeated:
-                self.masks.append((operation, mask))
-            wanted_operation, wanted = self.masks[self.made]
-            assert operation is wanted_operation
-            if self.repeated:
-                common = min(len(mask), len(wanted))  # a split's mask ends with the duplicates just made
-                self.differing += int((mask[:common] != wanted[:common]).sum())
-                self.chosen += int(wanted.sum())
-            self.made += 1
-            torch.manual_seed(self.made)
-            operation(params=params, optimizers=optimizers, state=state, mask=wanted, **options)
-
-        return surgery
-
-
 def trainings(monkeypatch):
     """Name of the rasterizer -> a training with it, from options of DefaultStrategy and a seed to its result."""
     folder = os.environ.get("TURBOGS_SCENE")
@@ -271,28 +236,3 @@ def test_our_rasterizer_trains_as_gsplats_does(monkeypatch, options, seeds, boun
         assert all(result.last_psnr > result.first_psnr + 3 for result in results)
         means[name] = sum(result.last_psnr for result in results) / seeds
     assert abs(means["ours"] - means["gsplat"]) <= bound
-
-
-def test_our_rasterizer_trains_as_gsplats_does_with_the_same_surgery(monkeypatch):
-    """The same, without the chaos of the decisions of density control."""
-    surgery, psnr = Surgery(monkeypatch), {}
-    for name, train in trainings(monkeypatch).items():
-        psnr[name] = train({}).last_psnr
-        surgery.repeat()
-    print(f"{surgery.differing} decisions differ, {surgery.chosen} Gaussians were chosen")
-    assert abs(psnr["ours"] - psnr["gsplat"]) <= 0.1
-    assert surgery.chosen > 0 and surgery.differing <= 0.2 * surgery.chosen
-
-
-def opposite_corners(*size, device):
-    """In place of the random numbers of a split [2, N, 3]: its halves lie on two sides of the middle."""
-    return torch.tensor([0.8, -0.8], device=device)[:, None, None].expand(size)
-
-
-def test_our_rasterizer_trains_as_gsplats_does_where_splits_draw_nothing(monkeypatch):
-    """Decisions as free as in the first of these tests, but none of them moves the random numbers of later splits."""
-    monkeypatch.setattr(torch, "randn", opposite_corners)
-    means = {}
-    for name, train in trainings(monkeypatch).items():
-        means[name] = sum(train({}).last_psnr for _ in range(3)) / 3
-    assert abs(means["ours"] - means["gsplat"]) <= 0.1

@@ -25,7 +25,6 @@ from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.reference.draws import draw_pixels
 from turbogs_plugin.engine.reference.losses import sparse_loss
 from turbogs_plugin.engine.reference.raster import rasterize_reference
-from turbogs_plugin.engine.render import rasterize
 from turbogs_plugin.engine.render_pass import RenderOptions
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
@@ -34,7 +33,7 @@ from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import BLACK, Step
+from turbogs_plugin.types import Step
 
 pytestmark = GPU_ONLY
 
@@ -133,16 +132,6 @@ def test_a_background(with_depth, workspace):
     theirs = expected.backward(**values, with_statistics=True).full_records()
     for name, column in RECORD_COLUMNS.items():
         assert_gradients_close(ours[..., column], theirs[..., column], name)
-
-
-def test_black_is_as_without_a_background():
-    """Bit for bit."""
-    case = make_case([(130, 90)], count=300, rate=0.3, seed=4)
-    plain, black = (
-        rasterize(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples, **options)
-        for options in ({}, {"background": BLACK})
-    )
-    assert torch.equal(plain.colors, black.colors)
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,10 @@ import gc
 
 import pytest
 import torch
+from helpers.raster_cases import GPU_ONLY
 from helpers.synthetic_capture import synthetic_scene
 
 from turbogs_plugin.config.configuration import Config, load_config
-from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.error_maps import AGE_MAX
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.plan.memory import hold_to_limit, within_memory
@@ -18,10 +18,7 @@ from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.trainer import Trainer
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not kernels.available(), reason="needs a GPU and the kernels"),
-]
+pytestmark = GPU_ONLY
 
 GPU = torch.device("cuda")
 LIMIT = "6GiB"

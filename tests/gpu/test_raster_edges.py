@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.raster_cases import GPU_ONLY, make_case, on_gpu, samples_to, upstream
+from helpers.raster_cases import GPU_ONLY, make_case, on_gpu, on_side_stream, samples_to, upstream
 
 from turbogs_plugin.engine.cuda import library, workspace
 from turbogs_plugin.engine.cuda import raster as cuda
@@ -45,18 +45,17 @@ def test_none_visible(case):
     assert (rendered.backward(torch.ones_like(rendered.colors)).full_records() == 0).all()
 
 
-def test_no_samples(case):
+@pytest.mark.parametrize("has_workspace", [False, True])
+def test_no_samples(case, has_workspace):
+    """Records are cleared though nothing is rendered."""
+    memory = Workspace("cuda") if has_workspace else None
     none = {"pixel_ids": case.gpu_samples.pixel_ids[:0], "tile_ids": case.gpu_samples.tile_ids[:0]}
     case.gpu_samples = replace(case.gpu_samples, **none, tile_offsets=case.gpu_samples.tile_offsets[:1])
-    rendered = render(case)
+    if memory is not None:
+        poison_records(memory, case)
+    rendered = render(case, workspace=memory)
     assert rendered.colors.shape == (0, 3)
     assert (rendered.backward(rendered.colors).full_records() == 0).all()
-
-
-def test_one_pixel():
-    case = make_case([(1, 1)], count=50, seed=12)
-    wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
-    torch.testing.assert_close(render(case).colors.cpu().double(), wanted.colors, rtol=1e-4, atol=1e-4)
 
 
 def test_not_finite_parameters_are_not_drawn(case):
@@ -106,24 +105,11 @@ def test_draws_what_the_reference_draws(case, limit, degree):
 
 def test_side_stream(case):
     wanted = render(case).colors
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        torch.cuda._sleep(50_000_000)  # work on the default stream would overtake this
-        delayed = case.gpu_gaussians.map(lambda value: value + 0)
-        case.gpu_gaussians = delayed
-        got = render(case).colors
-    stream.synchronize()
-    assert torch.equal(got, wanted)
 
+    def delayed():
+        return render(replace(case, gpu_gaussians=case.gpu_gaussians.map(lambda value: value + 0))).colors
 
-def test_the_current_stream_is_torchs():
-    torch.zeros(1, device="cuda")
-    device = torch.device("cuda", torch.cuda.current_device())
-    for stream in (torch.cuda.default_stream(), *(torch.cuda.Stream() for _ in range(3))) * 2:
-        with torch.cuda.stream(stream):
-            for asked in (device, torch.device("cuda")):
-                assert torch.cuda.current_stream(asked) == torch.cuda.current_stream() == stream
+    assert torch.equal(on_side_stream(delayed), wanted)
 
 
 def test_forward_is_deterministic(case):
@@ -264,16 +250,6 @@ def test_what_is_off_screen_has_no_record(case, rows):
     for name in (*PARAMETER_NAMES, "view_losses"):
         got = getattr(gradients, name)
         torch.testing.assert_close(got, getattr(wanted_gradients, name), rtol=1e-3, atol=1e-3, msg=name)
-
-
-def test_no_tiles_and_a_workspace(case):
-    """Records are cleared though nothing is rendered."""
-    memory = Workspace("cuda")
-    none = {"pixel_ids": case.gpu_samples.pixel_ids[:0], "tile_ids": case.gpu_samples.tile_ids[:0]}
-    case.gpu_samples = replace(case.gpu_samples, **none, tile_offsets=case.gpu_samples.tile_offsets[:1])
-    poison_records(memory, case)
-    rendered = render(case, workspace=memory)
-    assert (rendered.backward(rendered.colors).full_records() == 0).all()
 
 
 def test_overflow_is_noticed_and_passes_are_repeated(case, monkeypatch):

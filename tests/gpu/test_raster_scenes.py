@@ -80,21 +80,10 @@ def test_colors(case, steady):
 
 
 @pytest.mark.parametrize(
-    ("of_all", "bound"),
-    [
-        pytest.param(False, GRADIENT_BOUND, id="of steady samples"),
-        pytest.param(True, 10 * GRADIENT_BOUND, id="of all samples"),
-    ],
+    ("samples", "bound"),
+    [("steady", GRADIENT_BOUND), ("of equal color", GRADIENT_BOUND), ("all", 10 * GRADIENT_BOUND)],
 )
-def test_gradients(case, steady, of_all, bound):
-    got = rasterize(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
-    wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
-    values = upstream(case)
-    values["color_gradients"][~(steady | of_all)] = 0.0
-    assert_all_gradients_close(case, got, wanted, values, bound)
-
-
-def test_gradients_differ_by_samples_of_another_color_alone(case, steady):
+def test_gradients(case, steady, samples, bound):
     """Gradients of all samples may be farther apart than the bound of steady ones, as in float32 on some models
     (docs/lab/speed.md). A few samples explain it, whose colors are beyond their bound by a decision made otherwise."""
     got = rasterize(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
@@ -102,8 +91,9 @@ def test_gradients_differ_by_samples_of_another_color_alone(case, steady):
     decided_otherwise = ((got.colors.double().cpu() - wanted.colors).abs() > FORWARD_BOUND).any(dim=-1)
     assert not (decided_otherwise & steady).any() and decided_otherwise.double().mean() <= FLIP_SHARE
     values = upstream(case)
-    values["color_gradients"][decided_otherwise] = 0.0
-    assert_all_gradients_close(case, got, wanted, values, GRADIENT_BOUND)
+    left_out = {"steady": ~steady, "of equal color": decided_otherwise, "all": torch.zeros_like(steady)}[samples]
+    values["color_gradients"][left_out] = 0.0
+    assert_all_gradients_close(case, got, wanted, values, bound)
 
 
 def assert_all_gradients_close(case, got, wanted, values, bound):

@@ -25,6 +25,8 @@ from helpers.stiff_tiles import (
     toward_the_photo,
 )
 from helpers.tolerances import GPU_STATISTICS, GPU_STIFF_STATISTICS, STRUCTURE_BOUND
+from turbogs_plugin.bench.statistics import CASES as MEASURED
+from turbogs_plugin.bench.statistics import measure_case, measure_window
 
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
@@ -54,16 +56,16 @@ def test_all_absolute_gradients_share_the_colours_gradient(case):
     assert share_of_bound(case, "cuda") <= 1
 
 
-def test_squares_that_overflow():
-    assert_squares_that_overflow_are_survived("cuda")
-
-
-def test_gradients_that_overflow():
-    assert_gradients_that_overflow_are_survived("cuda")
-
-
-def test_gradients_that_vanish():
-    assert_gradients_that_vanish_are_survived("cuda")
+@pytest.mark.parametrize(
+    "assert_survived",
+    [
+        assert_squares_that_overflow_are_survived,
+        assert_gradients_that_overflow_are_survived,
+        assert_gradients_that_vanish_are_survived,
+    ],
+)
+def test_what_overflows_or_vanishes(assert_survived):
+    assert_survived("cuda")
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 40, 1000])

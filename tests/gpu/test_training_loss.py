@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.raster_cases import GPU_ONLY, on_side_stream
 
-from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.cuda import training as training_kernels
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.reference.draws import draw_pixels
@@ -16,10 +16,7 @@ from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.types import Step
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not kernels.available(), reason=kernels.unavailable_reason() or "available"),
-]
+pytestmark = GPU_ONLY
 
 DEVICE = "cuda"
 SIZES = np.array([(40, 33), (20, 17), (64, 48)], dtype=np.int64)
@@ -165,12 +162,7 @@ def test_side_stream_and_half_colors():
     colors, targets, _ = make_colors(samples)
     colors, targets, samples = colors.half().to(DEVICE), targets.to(DEVICE), to_device(samples)
     expected = training_kernels.sparse_loss(CASES["ncc"].terms, colors, targets, samples)
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        torch.cuda._sleep(50_000_000)  # work on the default stream would overtake this
-        found = training_kernels.sparse_loss(CASES["ncc"].terms, colors + 0, targets + 0, samples)
-    stream.synchronize()
+    found = on_side_stream(lambda: training_kernels.sparse_loss(CASES["ncc"].terms, colors + 0, targets + 0, samples))
     assert torch.equal(found.color_gradients, expected.color_gradients)
     assert torch.equal(found.pixel_errors, expected.pixel_errors)
     assert expected.color_gradients.any()

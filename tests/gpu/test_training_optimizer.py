@@ -5,11 +5,11 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
+from helpers.raster_cases import GPU_ONLY, on_side_stream
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.distributed.peer_memory import aligned_starts
 from turbogs_plugin.engine.cuda import launches
-from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.cuda import training as training_kernels
 from turbogs_plugin.engine.cuda.raster import CudaScreenGradients
 from turbogs_plugin.engine.layout import MAX_VIEWS, ScreenRecord
@@ -30,10 +30,7 @@ from turbogs_plugin.types import (
     Step,
 )
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not kernels.available(), reason=kernels.unavailable_reason() or "available"),
-]
+pytestmark = GPU_ONLY
 
 DEVICE = "cuda"
 SIZES = [(48, 32), (33, 40), (64, 20)]
@@ -114,6 +111,14 @@ class Scene:
 
     def on_device(self):
         return self.gaussians.map(lambda value: value.to(DEVICE, copy=True))
+
+
+def one_step(optimizer, scene, gaussians=None):
+    """The Gaussians after one fused step of an optimizer that begins."""
+    gaussians = scene.on_device() if gaussians is None else gaussians
+    optimizer.setup(gaussians)
+    training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, optimizer.moments)
+    return gaussians
 
 
 def doubled(value):
@@ -255,12 +260,7 @@ def test_a_step_changes_copies_alike(degree):
 def test_balanced_step_without_shares_is_adam():
     scene = Scene()
     scene.records[..., ScreenRecord.ERROR_SUM] = 0
-    stepped = []
-    for optimizer in (MomentLMOptimizer(RATES), SparseAdam(RATES, eps=1e-20)):
-        gaussians = scene.on_device()
-        optimizer.setup(gaussians)
-        training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, optimizer.moments)
-        stepped.append(gaussians)
+    stepped = [one_step(optimizer, scene) for optimizer in (MomentLMOptimizer(RATES), SparseAdam(RATES, eps=1e-20))]
     for parameter, value in stepped[0].items():
         assert torch.equal(value, getattr(stepped[1], parameter)), parameter
 
@@ -269,11 +269,10 @@ def test_rows_of_vanishing_loss_are_cut():
     """Shares of the loss down to denormals: the scaled rows would overflow without their limit."""
     scene, optimizer = Scene(), OPTIMIZERS["lm unbound"]
     scene.records[..., ScreenRecord.ERROR_SUM] *= 1e-33
-    gaussians, expected = scene.on_device(), scene.gaussians.map(doubled)
+    expected = scene.gaussians.map(doubled)
     optimizer.setup(expected)
     twin_step(optimizer, expected, scene)
-    optimizer.setup(gaussians)
-    training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, optimizer.moments)
+    gaussians = one_step(optimizer, scene)
     for parameter in ("means", "scales", "quats", "sh0", "opacities"):
         start, end = getattr(scene.gaussians, parameter).double(), getattr(gaussians, parameter).double().cpu()
         wanted = getattr(expected, parameter)
@@ -291,10 +290,7 @@ def test_bad_gradient_is_skipped_and_neighbours_step(name, entry):
     results = []
     for value in (1e-5, float("nan")):
         scene.records[1, bad, entry] = value
-        gaussians = scene.on_device()
-        optimizer.setup(gaussians)
-        training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, optimizer.moments)
-        results.append((gaussians, optimizer.moments))
+        results.append((one_step(optimizer, scene), optimizer.moments))
     (clean, clean_moments), (found, moments) = results
     assert int(clean_moments.skipped) == 0 and int(moments.skipped) == 1
     assert int(moments.steps[bad]) == 0
@@ -329,9 +325,8 @@ def test_any_number_of_gaussians(count):
     scene.gaussians = scene.gaussians.map(lambda value: value[keep].contiguous())
     scene.records = scene.records[:, keep].contiguous()
     scene.radii = scene.radii[:, keep].contiguous()
-    gaussians, optimizer = scene.on_device(), OPTIMIZERS["lm"]
-    optimizer.setup(gaussians)
-    training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, optimizer.moments)
+    optimizer = OPTIMIZERS["lm"]
+    one_step(optimizer, scene)
     touched = (scene.records[..., ScreenRecord.WEIGHT_SUM] > 0).any(dim=0)
     assert torch.equal(optimizer.moments.steps.cpu().bool(), touched)
     assert len(scene.screen().parameter_gradients(True).touched) == count
@@ -351,28 +346,24 @@ def test_wrong_tensors_are_named():
 
 def test_more_views_than_the_kernels_take_are_refused():
     scene = Scene(count=20, views=MAX_VIEWS + 1)
-    gaussians, optimizer = scene.on_device(), OPTIMIZERS["lm"]
-    optimizer.setup(gaussians)
     with pytest.raises(InputError, match="views, got 129"):
-        training_kernels.fused_step(optimizer.rule(STEP), scene.screen(gaussians), gaussians, optimizer.moments)
+        one_step(OPTIMIZERS["lm"], scene)
     with pytest.raises(InputError, match="views, got 129"):
         scene.screen().parameter_gradients(False)
 
 
 def test_side_stream():
     scene, optimizer = Scene(), OPTIMIZERS["lm"]
-    wanted = scene.on_device()
-    optimizer.setup(wanted)
-    training_kernels.fused_step(optimizer.rule(STEP), scene.screen(wanted), wanted, optimizer.moments)
+    wanted = one_step(optimizer, scene)
     start = scene.screen()
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        torch.cuda._sleep(50_000_000)  # work on the default stream would overtake this
+
+    def delayed():
         gaussians = start.scene.gaussians.map(lambda value: value + 0)
         screen = replace(start, scene=replace(start.scene, gaussians=gaussians), records=start.records + 0)
         optimizer.setup(gaussians)
         training_kernels.fused_step(optimizer.rule(STEP), screen, gaussians, optimizer.moments)
-    stream.synchronize()
+        return gaussians
+
+    found = on_side_stream(delayed)
     for parameter, value in wanted.items():
-        assert torch.equal(value, getattr(gaussians, parameter)), parameter
+        assert torch.equal(value, getattr(found, parameter)), parameter

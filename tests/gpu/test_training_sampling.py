@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from helpers.raster_cases import GPU_ONLY
 
-from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.cuda import training as training_kernels
 from turbogs_plugin.engine.reference.draws import WEIGHT_FLOOR, draw_pixels
 from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, exponentials, random_words
@@ -12,10 +12,7 @@ from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.types import Step
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not kernels.available(), reason=kernels.unavailable_reason() or "available"),
-]
+pytestmark = GPU_ONLY
 
 DEVICE = "cuda"
 SIZES = [(40, 33), (16, 16), (7, 50), (128, 64)]  # whole tiles, edge tiles, one tile, a narrow image

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import pytest
 import torch
@@ -14,6 +16,8 @@ from turbogs_plugin.engine.layout import ScreenRecord, columns
 from turbogs_plugin.engine.reference.raster import rasterize_reference
 from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
+
+Result = TypeVar("Result")
 
 GPU_ONLY = [
     pytest.mark.gpu,
@@ -93,6 +97,17 @@ def upstream(case: Case, seed: int = 0) -> dict[str, Tensor]:
 
 def on_gpu(values: dict[str, Tensor], device: str = "cuda") -> dict[str, Tensor]:
     return {name: value.float().to(device) for name, value in values.items()}
+
+
+def on_side_stream(work: Callable[[], Result]) -> Result:
+    """The result of `work` on a stream of its own, which sleeps first: work on the default stream would overtake it."""
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        torch.cuda._sleep(50_000_000)
+        result = work()
+    stream.synchronize()
+    return result
 
 
 def assert_forward_close(got: Tensor, wanted: Tensor, what: str) -> None:

@@ -46,13 +46,13 @@ class Exposures:
 
     @classmethod
     def identity(cls, views: int, device: torch.device | str) -> Exposures:
-        """Of photos that were never updated."""
+        """Exposures of photos that were never updated."""
         offsets, exp_avg, exp_avg_sq = torch.zeros(3, views, 3, 4, device=device).unbind()
         return cls(offsets, exp_avg, exp_avg_sq, torch.zeros(views, dtype=torch.int32, device=device))
 
     @classmethod
     def of_gains(cls, gains: Tensor, device: torch.device | str) -> Exposures:
-        """Of photos that were never updated, but are known to differ by gains.
+        """Exposures of photos that were never updated, but are known to differ by gains.
 
         Args:
             gains: [V, 3] of the channels, in stops: factors of 2.

@@ -44,7 +44,7 @@ MAX_PEERS = 8
 
 
 class PassStatus:
-    """What a process says of a pass: int32."""
+    """Report of a process on a pass: int32."""
 
     INTERSECTIONS = 0  # of tiles and splats
     OVERFLOW = 1  # not 0: there was too little memory, and the pass draws nothing
@@ -126,7 +126,7 @@ class ViewRow:
 
 
 class DrawRow(ViewRow):
-    """A view of a batch, as input of the sampler: a row of integers, those of `ViewRow` first."""
+    """A view of a batch, as input of the sampler: a row of integers, `ViewRow` first."""
 
     FIRST_SLOT = 4  # for unit = tile the first chosen tile
     STAGES = slice(5, 8)  # units of the hard, the stable and the mixed stage: of a tile, or for unit = tile of the view

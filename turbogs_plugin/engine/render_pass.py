@@ -68,7 +68,7 @@ class ScreenGradients(Protocol):
         """[K, N, 16] the gradients on the screen, `layout.ScreenRecord`; zero where a Gaussian is not drawn."""
 
     def plain(self) -> ScreenRecords:
-        """As plain tensors, from which `Engine.screen_gradients` makes them again."""
+        """Plain tensors; the inverse of `Engine.screen_gradients`."""
 
 
 def require_statistics(with_statistics: bool, stats: GaussianStats | None) -> None:
@@ -136,7 +136,7 @@ class Rendered(ABC):
 
     @abstractmethod
     def _backward(self, upstream: Upstream, with_statistics: bool) -> ScreenGradients:
-        """`backward`, with its tensors together."""
+        """Body of `backward`."""
 
 
 EXTENT_MAX = 3.33
@@ -144,7 +144,7 @@ EXTENT_MAX = 3.33
 an opaque splat fades to 1/255 at 3.329."""
 
 ALPHA_MIN_LOWEST = math.exp(-(EXTENT_MAX**2) / 2)
-"""The largest opacity that a splat can have at `EXTENT_MAX`."""
+"""Share of its opacity that a splat has left at `EXTENT_MAX` standard deviations: exp(-3.33^2 / 2)."""
 
 
 @dataclass(frozen=True)

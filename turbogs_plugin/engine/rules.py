@@ -52,7 +52,7 @@ class DrawRule:
         return min(units, step * max(1, math.floor(rate * units / step + slack)))
 
     def origin(self, iteration: int, masked: bool) -> tuple[int, int]:
-        """Of the grid of tiles in an iteration, see `TileGrid`.
+        """Origin (x, y) of the grid of tiles in an iteration, pixels; see `TileGrid`.
 
         Whole tiles begin elsewhere in each iteration, so that no pixel is always at the edge of its tile, where the
         windows that a loss compares are cut: at the points of a sequence that fills the square evenly (Roberts 2018,
@@ -99,8 +99,8 @@ class LossTerms:
     """A loss on samples (paper section 3.7); `engine.reference.losses` defines its value and gradient.
 
     Args:
-        epsilon: of the Charbonnier term.
-        l1_weight: factor of that term.
+        epsilon: rounding radius of the Charbonnier term, in units of colour.
+        l1_weight: factor of the Charbonnier term.
         structure: one of `layout.STRUCTURES`.
         structure_weight: factor of the mean over tiles and channels of 1 - S, S the similarity.
         variance_constant: c of `ncc`, epsilon of `printed_ncc`.

@@ -30,8 +30,8 @@ class CudaEngine(BaseEngine):
     """`Engine` on one CUDA device, on torch's current stream, float32.
 
     Args:
-        device: that of a training, whose passes share memory and never wait for the GPU (`Workspace`). None: each pass
-            has memory of its own and waits once, to learn how many intersections it has.
+        device: CUDA device of a training, whose passes share memory and never wait for the GPU (`Workspace`). None:
+            each pass has memory of its own and waits once, to learn how many intersections it has.
     """
 
     def __init__(self, device: torch.device | None = None) -> None:

@@ -90,7 +90,7 @@ class CudaScreenGradients:
 
     Args:
         scene: what was drawn. Its Gaussians are raw parameters, the caller's own tensors if those were contiguous.
-        samples: those of the pass.
+        samples: the pass's samples.
         records: [K, N, 16] float32, `layout.ScreenRecord`. Where a Gaussian is off screen, a record may hold anything.
         radii: [K, N, 2] int32, zero where off screen.
         with_statistics: whether the columns that only density control asks for were filled.

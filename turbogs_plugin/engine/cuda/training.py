@@ -43,7 +43,7 @@ from turbogs_plugin.types import (
 
 
 def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
-    """`Engine.draw`: the sets are those of `draw_pixels`. `view_ids`: at most `MAX_VIEWS`."""
+    """`Engine.draw`: sets equal to `draw_pixels`'s. `view_ids`: at most `MAX_VIEWS`."""
     library.require()
     maps.fetch(view_ids)
     views = np.asarray(view_ids, dtype=np.int64)
@@ -106,7 +106,7 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
 
 @dataclass(frozen=True)
 class _Places:
-    """What a draw takes from views of given sizes.
+    """Sizes of a draw from views of given sizes.
 
     Args:
         chosen: tiles of all views that get samples.
@@ -138,7 +138,7 @@ def _places(
     tiles: tuple[int, ...],
     live_starts: tuple[int, ...] | None,
 ) -> _Places:
-    """Kept, as a hundred iterations ask for the same: to make them takes the host longer than to enqueue the draw.
+    """Sizes of a draw, cached: a hundred iterations ask for equal ones, and making them takes longer than the launch.
 
     Args:
         wanted: of each view, from `_wanted`.
@@ -248,7 +248,7 @@ def sparse_loss(
 
 
 def _loss_output(slots: int, device: torch.device, workspace: Workspace | None) -> LossOutput:
-    """What the kernel fills: the loss is zero."""
+    """Output for the kernel to fill; its loss is zero."""
     if workspace is None:
         zero = torch.zeros((), dtype=torch.float64, device=device)
         return LossOutput(zero, torch.empty(slots, 3, device=device), torch.empty(slots, device=device))

@@ -81,7 +81,7 @@ class Compositor:
             begin = end
 
     def slices(self, table: Tensor) -> Iterator[tuple[Block, Tensor, Tensor, Slice]]:
-        """Every slice of every block, those of a block front to back until all its pixels are opaque.
+        """Every slice of every block; a block's slices come front to back, until all its pixels are opaque.
 
         Args:
             table: see `splat_table`.

@@ -190,7 +190,7 @@ class _Batch:
     words: Callable[[Tensor, int], Words]
 
     def ends(self, unit: str, wanted: Sequence[int]) -> DrawEnds:
-        """`PixelSamples.host_ends` where so many units are drawn of each view, or of each of its tiles."""
+        """`PixelSamples.host_ends` for `wanted` units drawn of each view, or of each of its tiles."""
         live = None if self.live_tiles is None else tuple(self.counts.tolist())
         return DrawEnds(unit, tuple(map(tuple, self.sizes.tolist())), tuple(wanted), live)
 

@@ -42,7 +42,7 @@ def solve_scaled_cholesky(rows: Tensor, weights: Tensor, damping: Tensor, rhs: T
 
 
 def solve_low_rank(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
-    """The same answer from a K x K system (Woodbury): cheaper where there are fewer rows than parameters."""
+    """Woodbury's form, a K x K system: cheaper than D x D where there are fewer rows than parameters."""
     scale = torch.rsqrt(damping)
     scaled = scaled_rows(rows, weights, damping)
     scaled_rhs = rhs * scale

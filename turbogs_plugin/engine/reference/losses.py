@@ -2,7 +2,7 @@
 appendix).
 
 Every loss is a mean over all filled samples of the K views together, or over the listed tiles, so its gradients are as
-large as those of a dense mean loss. Half-precision colours are converted to single precision, and so are their
+large as the gradients of a dense mean loss. Half-precision colours are converted to single precision, and so are their
 gradients. A sample whose colour is not finite adds no loss and no gradient, and its error is 0; it still counts in the
 mean. With autograd upstream: ``colors.backward(out.color_gradients)``.
 
@@ -141,7 +141,7 @@ SIMILARITIES: dict[str, Callable[[_Problem, float], Similarity]] = {
 
 
 class _Problem:
-    """The start of every loss: inputs in the precision of the computation, and the Charbonnier term.
+    """Start of every loss: inputs in the precision of the computation, and the Charbonnier term.
 
     The term is ``mean over filled samples of w * mean over channels of (sqrt(d^2 + eps^2) - eps)``, d = x - y. It is
     the paper's minus a constant, so that it is 0 at d = 0. `slopes` [P, 3] is ``d / sqrt(d^2 + eps^2)``.
@@ -216,7 +216,7 @@ def window_similarity(
         S_i = (2 m_x m_y + c1) / (m_x^2 + m_y^2 + c1) * (2 s_xy + c) / (s_x^2 + s_y^2 + c)
         h_j = sum over i of w_i g(i - j) / n_i * (a_i (y_j - m_y,i) - b_i (x_j - m_x,i) + l_i)
 
-    a, b and l are those of the sample's window: ``2 L / (s_x^2 + s_y^2 + c)``, ``S a / L`` and the slope of the
+    a, b and l belong to the sample's window: ``2 L / (s_x^2 + s_y^2 + c)``, ``S a / L`` and the slope of the
     luminance term L with m_x, times the other. With ``omega_j = w_j / sum(w)`` over the tile, the tile's similarity is
     ``sum of omega_i S_i`` and its derivative with x_j is ``omega_j h_j``.
 

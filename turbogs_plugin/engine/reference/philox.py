@@ -32,7 +32,7 @@ from torch import Tensor
 
 from turbogs_plugin.types import Step
 
-PURPOSE_PIXELS, PURPOSE_TILES = 0, 2  # 1 was that of a unit that is gone
+PURPOSE_PIXELS, PURPOSE_TILES = 0, 2  # 1 is not in use
 PURPOSE_VIEWS, PURPOSE_STACK, PURPOSE_BACKGROUND, PURPOSE_GROWTH, PURPOSE_DROPOUT = range(3, 8)
 
 MASK = 0xFFFFFFFF

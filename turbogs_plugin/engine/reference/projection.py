@@ -123,7 +123,7 @@ def project_rows(
     """Project rows; differentiable in the parameters.
 
     Args:
-        parameters: those of the rows, see `Rows.take`.
+        parameters: [R, ...] of the rows, see `Rows.take`.
         cameras: the K views.
         sh_degree: 0 .. 3.
     """

@@ -35,7 +35,7 @@ class ReferenceScreenGradients:
         splats: their projection, connected to `leaves` by autograd.
         leaves: the parameters of the rows, see `Rows.take`.
         records: [R, 16], see `layout.ScreenRecord`.
-        samples: those of the pass.
+        samples: the pass's samples.
         with_statistics: whether the pass summed up statistics.
     """
 

@@ -1,8 +1,8 @@
 """The arguments of the operators of csrc/: a class for each operator, a field for each argument.
 
 `library.launch` calls an operator with four lists: the tensors, integers, reals and rows of views of the launch. Each
-list is in the order of the fields; those of a nested class stand in its place. The build writes the same order into a
-C++ header (csrc/generate_headers.py). So no order is written down twice, and when they run these files import neither
+list is in the order of the fields; the fields of a nested class stand in its place. The build writes this order into a
+C++ header (csrc/generate_headers.py), so no order is written down twice, and when they run these files import neither
 torch nor anything of the package but each other.
 
 Letters in shapes: K views, N Gaussians, T tiles with samples, P sample slots, M the most intersections of tiles and
@@ -65,7 +65,7 @@ class Scene:
     """The Gaussians and the views of a batch."""
 
     gaussians: GaussianArrays
-    viewmats: Tensor  # [C, 4, 4] float32, of the capture's cameras or of those of the views alone
+    viewmats: Tensor  # [C, 4, 4] float32, the capture's cameras, or the views' alone
     Ks: Tensor  # [C, 3, 3] float32
     images: list[int]  # [K] layout.ImageRow
     sh_degree: int  # to evaluate
@@ -197,7 +197,7 @@ class RasterForward(Launch):
 class RasterBackward(Launch):
     """Stage 6: the gradients on the screen, as records, with the sums for density control."""
 
-    forward: RasterForward  # that of the pass
+    forward: RasterForward  # the pass's own launch
     upstream: Upstream  # [P, 3] and [P] float32; depth gradients only of a pass with depths
     records: Tensor  # [K * N, 16] float32
     with_density_sums: bool  # fill the columns that only density control asks for

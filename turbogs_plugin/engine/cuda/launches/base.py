@@ -48,7 +48,7 @@ def fields_of(**kinds: str) -> type:
 
 
 def field_types(cls: type) -> dict[str, str]:
-    """Name -> type of the fields of a class, those of its bases first."""
+    """Name -> type of the fields of a class, bases first."""
     own = (vars(base).get("__annotations__", {}) for base in reversed(cls.__mro__) if base is not Launch)
     return dict(field for fields in own for field in fields.items())
 
