@@ -74,14 +74,15 @@ def test_a_resized_model_covers_what_it_did(count):
 
 
 def test_contributions_are_the_set_bits_of_the_walked_masks():
-    # Two tiles of 40 and 5 intersections, one chunk each: 2 buckets of 32 and 1. Masks of tile t begin at
-    # start // 32 + t, so tile 1 begins at 2.
-    forward = SimpleNamespace(
-        tile_starts=torch.tensor([0, 40, 45], dtype=torch.int32),
+    # Two tiles of 40 and 5 intersections, one chunk each: buckets of 32, so 2 and 1. The masks of tile t begin at
+    # start // 32 + t.
+    pixels = SimpleNamespace(
         bucket_counts=torch.tensor([2, 1], dtype=torch.int32),
         chunks=1,
         masks=torch.tensor([0b1011, -1, 0b1, 0b11111], dtype=torch.int32),
     )
+    forward = SimpleNamespace(tile_starts=torch.tensor([0, 40, 45], dtype=torch.int32), pixels=pixels)
+    pixels.masks[2] = 0b1  # tile 1 begins at 40 // 32 + 1 = 2
     counts = floors.count_contributions(SimpleNamespace(_forward=forward))
     assert counts == {"walked": 96, "contributing": 3 + 32 + 1}
 

@@ -6,6 +6,7 @@ from helpers.framework_runs import assert_iterations_wait_for_nothing, tiny_capt
 from helpers.optimizers import STEP, clone, equal, make_gaussians, make_gradients
 from helpers.raster_cases import GPU_ONLY
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 from turbogs_plugin.strategies.learning_rates import LearningRates

@@ -14,6 +14,7 @@ from gsplat import DefaultStrategy, MCMCStrategy, rasterization
 from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
 from helpers.raster_cases import GPU_ONLY
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_loss, sparse_rasterization

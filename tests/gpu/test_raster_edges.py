@@ -201,7 +201,7 @@ def test_wrong_input_says_what_was_wanted(case):
     with pytest.raises(RuntimeError, match=r"pixel_ids must be a contiguous Int"):
         library.launch(replace(rendered._forward, pixel_ids=rendered._forward.pixel_ids.long()))
     with pytest.raises(RuntimeError, match="raster_forward needs colors"):
-        library.launch(replace(rendered._forward, colors=None))
+        library.launch(replace(rendered._forward, pixels=replace(rendered._forward.pixels, colors=None)))
 
 
 def test_workspace_gives_the_same_and_does_not_wait(case):

@@ -25,8 +25,6 @@ from helpers.stiff_tiles import (
     toward_the_photo,
 )
 from helpers.tolerances import GPU_STATISTICS, GPU_STIFF_STATISTICS, STRUCTURE_BOUND
-from turbogs_plugin.bench.statistics import CASES as MEASURED
-from turbogs_plugin.bench.statistics import measure_case, measure_window
 
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss

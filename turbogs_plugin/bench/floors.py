@@ -35,7 +35,7 @@ def raster_counts(rendered: CudaRendered, samples: PixelSamples) -> Counts:
         "intersections": int(rendered.num_intersections),
         "tiles": len(samples.tile_ids),
         "samples": len(samples),
-        "items": len(rendered._forward.bucket_counts),
+        "items": len(rendered._forward.pixels.bucket_counts),
         **count_contributions(rendered),
     }
 
@@ -43,13 +43,14 @@ def raster_counts(rendered: CudaRendered, samples: PixelSamples) -> Counts:
 def count_contributions(rendered: CudaRendered) -> Counts:
     """How many splats the work items of a pass walked, and how many of these contributed."""
     forward = rendered._forward
-    tile_starts, buckets, chunks = forward.tile_starts, forward.bucket_counts.long(), forward.chunks
+    tile_starts, pixels = forward.tile_starts, forward.pixels
+    buckets, chunks = pixels.bucket_counts.long(), pixels.chunks
     items = torch.arange(len(buckets), device=buckets.device)
     tiles = torch.arange(len(tile_starts) - 1, device=buckets.device)
     bases = (tile_starts[:-1].long() // BUCKET + tiles)[items // chunks]
     owners = torch.repeat_interleave(items, buckets)
     number = torch.arange(len(owners), device=buckets.device) - (buckets.cumsum(0) - buckets)[owners]
-    words = forward.masks[(bases[owners] + number) * chunks + owners % chunks]
+    words = pixels.masks[(bases[owners] + number) * chunks + owners % chunks]
     contributing = sum(int(((words >> bit) & 1).sum()) for bit in range(BUCKET))
     return {"walked": int(buckets.sum()) * BUCKET, "contributing": contributing}
 

@@ -145,9 +145,9 @@ def columns(row: type) -> dict[str, slice]:
     return found
 
 
-def interface(launches: list[type]) -> str:
-    """The order of the fields of `launches` and the numbers of this file, as text. A library from other sources has
-    another text."""
+def interface(launches: list) -> str:
+    """Order of the fields of `launches` (classes of `Launch`) and the numbers of this file, as text, which differs for
+    a library from other sources."""
     lines = []
     for cls in launches:
         lines.append(f"{cls.operator}: " + "; ".join(" ".join(names) for names in cls.paths))
