@@ -283,23 +283,6 @@ def test_where_the_grid_of_tiles_begins_does_not_matter(origin):
         torch.testing.assert_close(other, one, rtol=1e-9, atol=1e-12)
 
 
-def test_float32_is_close_to_float64():
-    """Thresholds may fall differently in rounding, at a cost of at most about alpha_min at that pixel."""
-    gaussians, cameras = make_gaussians(200, spread=1.5), make_cameras([(64, 48)])
-    samples = dense_samples(cameras)
-    colors, _, _, errors = upstream(samples)
-    double = rasterize(gaussians, cameras, samples)
-    single = rasterize(gaussians.map(torch.Tensor.float), cameras.to(dtype=torch.float32), samples)
-    difference = (single.colors - double.colors).abs()
-    assert float(difference.quantile(0.99)) < 2e-6
-    assert float(difference.max()) < 0.02
-    expected = double.backward(colors, errors).parameter_gradients(rows=False)
-    found = single.backward(colors.float(), errors.float()).parameter_gradients(rows=False)
-    for name in PARAMETER_NAMES:
-        ours, theirs = found.summed(name).double(), expected.summed(name)
-        assert float((ours - theirs).norm() / theirs.norm()) < 1e-3, name
-
-
 def test_block_and_slice_sizes_do_not_matter(monkeypatch):
     gaussians, cameras = make_gaussians(60), make_cameras(SIZES)
     gaussians.opacities += 3
