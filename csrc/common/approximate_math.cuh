@@ -2,7 +2,7 @@
 // nowhere else. Relative errors are about 2^-22.
 //
 // A build with TURBOGS_EXACT_MATH=1 has correctly rounded functions in their place, to measure what they cost: 6 to
-// 19 % of a forward and backward pass, at no error that shows beside float32's own (docs/performance.md).
+// 19 % of a forward and backward pass, at no error that shows beside float32's own.
 #pragma once
 
 #include <cfloat>

@@ -16,7 +16,7 @@ namespace turbogs {
 
 // A block owns this many consecutive Gaussians. Their harmonics are one contiguous piece of memory, which the block
 // moves in 16-byte quads; in shared memory each thread works on its own row, whose odd stride keeps the banks apart.
-// Measured best: 64 were 3 to 6 % slower, 192 no better (docs/performance-training-kernels.md).
+// Measured best: 64 were 3 to 6 % slower, 192 no better.
 constexpr int kBackwardThreads = 128;
 
 constexpr int kReciprocalBits = 20;  // enough that `BlockShared::owner` is exact for every element of a block

@@ -14,7 +14,7 @@
 namespace turbogs {
 namespace {
 
-// Measured together, as one design (docs/performance.md, step 10); there is no record of other values of any of them.
+// Measured together, as one design; there is no record of other values of any of them.
 constexpr int kScatterThreads = 256;
 constexpr int kScatterWarps = kScatterThreads / kWarpSize;
 constexpr int kScatterInstances = 2 * kScatterThreads;  // of a block: somewhat less than half of them are on screen

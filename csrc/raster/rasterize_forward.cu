@@ -15,7 +15,7 @@ constexpr int kForwardWarps = 4;  // of a block; they share nothing but the firs
 constexpr int kAhead = 2;         // splats whose arithmetic overlaps; no record of other values
 
 // Blocks of an SM, so 72 registers for one work item a warp and 80 for two. Left to itself the compiler took 72 for
-// two as well, and the pass 292 us in place of 251 (docs/performance.md, step 9).
+// two as well, and the pass 292 us in place of 251.
 constexpr int forward_blocks(int items) { return items == 1 ? 7 : 6; }
 
 constexpr float kLevelSlack = 0.01f;  // of a level (log2 of an alpha), for the rounding of the least one of a box

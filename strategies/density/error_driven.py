@@ -163,7 +163,7 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def bound(self, step: Step) -> int:
         """Most Gaussians after an event at this iteration; 0: any number. What is grown beyond the cap and then removed
-        by worth makes a better model of as many Gaussians than what never was beyond it (sweeps, eighteenth round)."""
+        by worth makes a better model of as many Gaussians than what never was beyond it (docs/lab/tried.md)."""
         return math.floor(self.max_gaussians * self.growth_room(step) + 1e-6)
 
     def _reduction_due(self, step: Step) -> bool:

@@ -84,8 +84,8 @@ def test_colors(case, steady):
     [("steady", GRADIENT_BOUND), ("of equal color", GRADIENT_BOUND), ("all", 10 * GRADIENT_BOUND)],
 )
 def test_gradients(case, steady, samples, bound):
-    """Gradients of all samples may be farther apart than the bound of steady ones, as in float32 on some models
-    (docs/lab/speed.md). A few samples explain it, whose colors are beyond their bound by a decision made otherwise."""
+    """Gradients of all samples may be farther apart than the bound of steady ones, as in float32 on some models.
+    A few samples explain it, whose colors are beyond their bound by a decision made otherwise."""
     got = rasterize(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
     wanted = rasterize_reference(case.gaussians, case.cameras, case.samples)
     decided_otherwise = ((got.colors.double().cpu() - wanted.colors).abs() > FORWARD_BOUND).any(dim=-1)

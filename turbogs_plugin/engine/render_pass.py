@@ -79,7 +79,7 @@ def require_statistics(with_statistics: bool, stats: GaussianStats | None) -> No
 
 @dataclass(frozen=True)
 class Upstream:
-    """What a backward pass starts from; the arguments of `Rendered.backward`."""
+    """Gradients and errors that a backward pass starts from; see `Rendered.backward`."""
 
     color_gradients: Tensor
     alpha_gradients: Tensor | None
@@ -189,7 +189,7 @@ DEFAULT_SETTINGS = RasterSettings()
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What to render of a model, and how.
+    """Options of a rendering pass.
 
     Args:
         sh_degree: highest degree of spherical harmonics to use; None for all that the model holds.

@@ -25,7 +25,7 @@ GRID_STEPS = (0.7548776662466927, 0.5698402909980532)
 
 @dataclass(frozen=True)
 class DrawRule:
-    """How the samples of an iteration are drawn (paper section 3.5); `engine.reference.draws` defines the draw.
+    """Draw of an iteration's samples (paper section 3.5); `engine.reference.draws` defines the draw.
 
     Args:
         unit: one of `layout.UNITS`.
@@ -43,7 +43,7 @@ class DrawRule:
     multiple: int = 1
 
     def wanted(self, rate: float, units: int) -> int:
-        """How many of `units` to draw: ``max(1, floor(rate * units))``, the paper's N_pix for the 256 pixels of a tile.
+        """Number of `units` to draw: ``max(1, floor(rate * units))``, the paper's N_pix for the 256 pixels of a tile.
 
         With `multiple` it is the nearest number: rounding down would lose up to half of a small budget.
         """
@@ -136,7 +136,7 @@ class ParameterRates:
 
 @dataclass(frozen=True)
 class MomentLMParams:
-    """What moment-damped LM needs beyond Adam; see `MomentLMOptimizer` for the meaning of each."""
+    """Settings of moment-damped LM beyond Adam; see `MomentLMOptimizer` for the meaning of each."""
 
     units: Literal["balanced", "paper"]
     rows: Literal["views", "summed"]

@@ -69,7 +69,7 @@ def _require(tensors: Iterable[tuple[str, Tensor]], dtype: torch.dtype, device: 
 
 
 def _ready(gaussians: Gaussians, workspace: Workspace | None) -> Gaussians:
-    """The model as kernels take it. With a workspace a model is looked at once, not at each pass."""
+    """The model as kernels take it; with a workspace a model is checked once, not at each pass."""
     if workspace is not None and workspace.knows(gaussians):
         return gaussians
     _check(gaussians)
@@ -251,7 +251,7 @@ class Buffers:
         return self.integers(name, *shape, dtype=torch.float32)
 
     def kept(self, name: str, make: Callable[..., Kept], *sizes: int) -> Kept:
-        """What `make` gives with these buffers and sizes; with a workspace, see `Workspace.kept`."""
+        """Result of `make` with these buffers and sizes; with a workspace, see `Workspace.kept`."""
         of_sizes = partial(make, self, *sizes)
         return of_sizes() if self.workspace is None else self.workspace.kept(name, sizes, of_sizes)
 

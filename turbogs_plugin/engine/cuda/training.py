@@ -124,7 +124,7 @@ class _Places:
 
 
 def _wanted(rule: DrawRule, rate: float, tiles: Sequence[int]) -> tuple[int, ...]:
-    """For each view, how many of its tiles are drawn, or how many pixels of each of its tiles."""
+    """Number of tiles drawn of each view, or of pixels drawn of each of its tiles."""
     if rule.unit == "tile":
         return tuple(rule.wanted(rate, count) for count in tiles)
     return (rule.wanted(rate, TILE_PIXELS),) * len(tiles)

@@ -34,7 +34,7 @@ MARGIN, EARLY_MARGIN, EARLY_PASSES = 1.15, 1.5, 32
 """Memory for intersections over the largest number expected: in general; in the first passes; how many these are."""
 
 FORGETTING = 0.998
-"""Each pass multiplies the largest count per tile by this, so that a rare peak does not cost sorting for ever."""
+"""Factor of the largest count per tile at each pass, so that a rare peak does not cost sorting for ever."""
 
 CAPACITY_STEP = 1 << 14
 """Capacities are multiples of this, so that sizes of scratch memory can be remembered."""
@@ -159,12 +159,12 @@ class Workspace:
         self._known[id(gaussians)] = ref(gaussians)
 
     def knows(self, gaussians: Gaussians) -> bool:
-        """Whether it is a model remembered, whose tensors need no look at each pass; operators look at them, too."""
+        """Whether a model is remembered: its tensors need no look at each pass, as operators look at them, too."""
         known = self._known.get(id(gaussians))
         return known is not None and known() is gaussians
 
     def kept(self, name: str, sizes: tuple, make: Callable[[], Kept]) -> Kept:
-        """What `make` gives; made anew only where the sizes are others than at the last call of this name.
+        """Result of `make`, made anew only where `sizes` differ from the last call of this name.
 
         For arguments of launches that are buffers of these sizes: they are the same for a hundred passes, and to put
         them together anew takes the host as long as to enqueue the launches.
@@ -187,7 +187,7 @@ class Workspace:
         return sum(held.numel() * held.element_size() for held in self._buffers.values())
 
     def capacity(self, gaussians: int, tiles: int) -> int | None:
-        """How many intersections a pass gets memory for, or None if nothing is known yet.
+        """Number of intersections that a pass gets memory for, or None if nothing is known yet.
 
         Passes may go on after a loss, and draw nothing until `take_lost`: several processes agree on it some passes
         later.
@@ -243,7 +243,7 @@ class Workspace:
             self.poll()
 
     def take_lost(self, wait: bool = False) -> int:
-        """How many of the latest passes did nothing and must be repeated. Clears the flag; the repetition will fit.
+        """Number of the latest passes that did nothing and must be repeated. Clears the flag; the repetition will fit.
 
         Args:
             wait: wait for every count under way, as at the end of training; else only arrived ones are looked at.

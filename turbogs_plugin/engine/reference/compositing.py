@@ -40,7 +40,7 @@ class Block:
 
 @dataclass
 class Compositor:
-    """What compositing needs beside the splats: intersections, pixels and settings.
+    """Inputs of compositing beside the splats: intersections, pixels and settings.
 
     Args:
         intersections: the M intersections of the T tiles.

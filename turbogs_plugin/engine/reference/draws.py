@@ -62,7 +62,7 @@ from turbogs_plugin.types import PixelSamples, Step, TileGrid
 RANK_BITS = 20
 AGE_TIE_BITS = 24
 WEIGHT_FLOOR = 2.0**-100
-"""So far below every positive weight that a unit of zero weight never wins against one with a positive weight."""
+"""Weight of a unit without error: so small that it never wins against a positive one."""
 
 
 @dataclass(frozen=True)

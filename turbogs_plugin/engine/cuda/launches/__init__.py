@@ -260,7 +260,7 @@ class TileScratch:
 
 
 NO_SCRATCH = TileScratch(None, None, None, None)
-"""For single pixels."""
+"""Scratch of a draw of single pixels: none."""
 
 
 @dataclass
