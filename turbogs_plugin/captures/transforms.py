@@ -259,7 +259,7 @@ def _read_points(scene: Path, name: Any, source: Path) -> tuple[np.ndarray, np.n
         )
     path = scene / file
     vertices = read_vertices(path)
-    if not {"x", "y", "z"} <= set(vertices.dtype.names or ()):
+    if not {"x", "y", "z"} <= set(vertices):
         raise InputError(f"{path} has no x, y, z: export it again, or take ply_file_path out of {source.name}")
     points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
     colors = read_colors(path, vertices)

@@ -49,8 +49,8 @@ def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
         points, colors = scene.points, scene.point_colors
         if init == "random":
             cameras = scene.train.cameras
-            matrices = (each.cpu().double().numpy() for each in (cameras.viewmats, cameras.Ks))
-            points = torch.from_numpy(starting_points(*matrices, cameras.sizes)[0]).float()
+            viewmats, Ks = cameras.viewmats.cpu().double().numpy(), cameras.Ks.cpu().double().numpy()
+            points = torch.from_numpy(starting_points(viewmats, Ks, cameras.sizes)[0]).float()
             colors = colors_in_photos(points, scene.train.cameras, scene.train.photos, scene.train.masks)
         rows = chosen_points(len(points), cap, backdrop_count)
         settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
