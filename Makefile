@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo ablation results pages test lint kernels wheel install clean
+.PHONY: demo ablation results pages test lint budgets kernels wheel install clean
 
 # One thread: the demo's tensors are small, and a second thread gains nothing but waits where the machine is shared.
 demo: export OMP_NUM_THREADS := 1
@@ -44,6 +44,11 @@ test: $(INSTALLED)
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+# Lines of every room beside their budgets, and the files of docs/.
+budgets: $(INSTALLED)
+	$(BIN)/python tests/test_rooms.py
 
 # The CUDA library, for development; wants nvcc but no GPU.
 kernels: $(INSTALLED)
