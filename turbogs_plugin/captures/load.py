@@ -59,7 +59,6 @@ def load_scene(
     factor: int = 1,
     test_every: int = 8,
     progress: Callable[[int, int], object] | None = None,
-    sized: Callable[[np.ndarray, np.ndarray], object] | None = None,
     meanwhile: Callable[[PosedViews, PosedViews, Tensor], object] | None = None,
 ) -> Scene:
     """Load a capture with its photos.
@@ -77,8 +76,6 @@ def load_scene(
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
             Captures with a split of their own (NeRF-synthetic, lists in a ``transforms.json``) keep it.
         progress: called with the number of photos decoded so far, and of all, by one thread at a time.
-        sized: called with the sizes [V, 2] (width, height) of training and of test views, before a photo is decoded;
-            what it raises ends the loading.
         meanwhile: called once, while photos are decoded, with training views, test views and the scene's points.
 
     Raises:
@@ -104,10 +101,7 @@ def load_scene(
             )
     parts = [np.flatnonzero(part & seen) for part in (~test, test)]
     posed = [_posed(capture, viewmats, files.sizes, views) for views in parts]
-    # Before minutes go into photos that have no room.
-    if sized is not None:
-        sized(*(files.sizes[views] for views in parts))
-    colors = [_room(capture, files, views) for views in parts]
+    colors = [_room(capture, files, views) for views in parts]  # before minutes go into photos that have none
     counter, one_at_a_time = itertools.count(1), Lock()
 
     def loaded() -> None:
@@ -128,7 +122,7 @@ def load_scene(
         files.note,
         undistortion_note(capture.lenses),
         mask_note,
-        _masked_note(capture.names, masks, mask_files, files.sizes, seen),
+        _masked_note(capture.names, masks, files.sizes, seen),
         "transparent photos are composited on a background (train.background)" if train.photos.transparent else "",
         file_note([train.photos.stored, tested.photos.stored], "photos"),
     )
@@ -200,38 +194,23 @@ def _load_views(
 ) -> PosedImages:
     """Some views with their photos, decoded into `colors`; the last two arguments are for `load_photos`."""
     paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
-    photos = load_photos(paths, files.file_sizes[views], files.sizes[views], lenses, colors, loaded, meanwhile)
-    masked = _pixel_masks([masks[view] for view in views], files.sizes[views])
-    names = tuple(capture.names[view] for view in views)
-    return PosedImages(posed.cameras, names, photos, masked, posed.observations)
+    sizes, own, masked = files.sizes[views], [masks[view] for view in views], None
+    photos = load_photos(paths, files.file_sizes[views], sizes, lenses, colors, loaded, meanwhile)
+    if any(mask is not None for mask in own):
+        pairs = zip(own, sizes.tolist(), strict=True)
+        masked = PixelMasks.of_views([ViewMask.whole(tuple(size)) if mask is None else mask for mask, size in pairs])
+    return PosedImages(posed.cameras, tuple(capture.names[v] for v in views), photos, masked, posed.observations)
 
 
-def _pixel_masks(masks: list[ViewMask | None], sizes: np.ndarray) -> PixelMasks | None:
-    """The masks of views of these `sizes` [V, 2]; None where none has a masked pixel."""
-    if all(mask is None for mask in masks):
-        return None
-    pairs = zip(masks, sizes.tolist(), strict=True)
-    return PixelMasks.of_views([ViewMask.whole(tuple(size)) if mask is None else mask for mask, size in pairs])
-
-
-def _masked_note(
-    names: tuple[str, ...],
-    masks: list[ViewMask | None],
-    files: list[Path | None],
-    sizes: np.ndarray,
-    seen: np.ndarray,
-) -> str:
-    """How much is masked, by the photos' alpha where no file does it, and which views are left out for it, in one line;
-    empty where nothing is masked."""
+def _masked_note(names: tuple[str, ...], masks: list[ViewMask | None], sizes: np.ndarray, seen: np.ndarray) -> str:
+    """How much is masked, and which views are left out for it, in one line; empty where nothing is masked."""
     pixels = {view: mask.pixels for view, mask in enumerate(masks) if mask is not None}
-    if not (cut := list(pixels)):
+    if not pixels:
         return ""
-    share = 1.0 - sum(pixels.values()) / int(sizes[cut].prod(axis=1).sum())
+    share = 1.0 - sum(pixels.values()) / int(sizes[list(pixels)].prod(axis=1).sum())
     gone = [name for name, kept in zip(names, seen, strict=True) if not kept]
     left_out = f"; {len(gone)} masked whole are left out: {gone[0]}, ..." if gone else ""
-    by_alpha = sum(files[view] is None for view in cut)
-    by = "" if not by_alpha else " by their alpha" if by_alpha == len(cut) else f" ({by_alpha} by their alpha alone)"
-    return f"{len(cut)} photos have masked pixels{by}, {share:.1%} of them{left_out}"
+    return f"{len(pixels)} photos have masked pixels, {share:.1%} of them{left_out}"
 
 
 def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
