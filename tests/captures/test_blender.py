@@ -100,15 +100,6 @@ def test_frames_without_a_photo_are_left_out(tmp_path):
     assert scene.notes[1] == "3 of 10 images are left out, their photos do not exist: train/r_1, ..."
 
 
-@pytest.mark.parametrize("name", ["train/r_9", "../lego/other/r_2"])
-def test_a_frame_that_names_no_photo_is_left_out(tmp_path, name):
-    folder = write_blender(tmp_path / "lego")
-    edit(folder, frame(file_path=name))
-    scene = load_scene(folder)
-    assert len(scene.train) == 5
-    assert f"1 of 10 images are left out, their photos do not exist: {name}" in scene.notes
-
-
 def test_where_no_test_photo_exists_every_8th_is_for_testing(tmp_path):
     folder = write_blender(tmp_path / "lego")
     shutil.rmtree(folder / "test")
@@ -139,30 +130,6 @@ def test_reduced_photos_mix_with_black(tmp_path):
     assert sorted(photo.amax(dim=2).flatten().tolist())[-4:] == pytest.approx([0, 64, 64, 64], abs=1)
     focal = 0.25 * SIZE[0] / math.tan(0.5 * ANGLE)
     np.testing.assert_allclose(scene.train.cameras.Ks[0], [[focal, 0, 15], [0, focal, 10], [0, 0, 1]], rtol=1e-6)
-
-
-def test_opaque_photos_and_intrinsics_of_newer_exporters(tmp_path):
-    """BlenderNeRF writes fl_x, fl_y, cx, cy, w, h too, and names with a suffix."""
-    folder = write_blender(tmp_path / "lego")
-    for part, count in SPLIT.items():
-        own = {"fl_x": 80.0, "fl_y": 82.0, "cx": 31.0, "cy": 19.0, "w": 60, "h": 40, "k1": 0.0}
-        edit(folder, lambda content, own=own: content.update(own), part)
-        for view in range(count):
-            Image.open(folder / part / f"r_{view}.png").convert("RGB").save(folder / part / f"r_{view}.JPG")
-            (folder / part / f"r_{view}.png").unlink()
-    edit(folder, lambda content: content["frames"][0].update(file_path="train/r_0.JPG"))
-    scene = load_scene(folder)
-    assert scene.train.names[0] == "train/r_0.JPG"
-    np.testing.assert_allclose(scene.train.cameras.Ks[0], [[80, 0, 31], [0, 82, 19], [0, 0, 1]])
-
-
-def test_photos_with_another_suffix(tmp_path):
-    folder = write_blender(tmp_path / "lego")
-    edit(folder, lambda content: [frame.update(file_path=f"{frame['file_path']}.jpg") for frame in content["frames"]])
-    scene = load_scene(folder)
-    assert len(scene.train) == 6 and scene.notes[1] == (
-        "6 photos are not where transforms_train.json says: train/r_0.png is taken for train/r_0.jpg, ..."
-    )
 
 
 def test_which_kind_is_taken_of_several(tmp_path):

@@ -223,11 +223,6 @@ def test_without_points_random_ones_are_drawn(tmp_path):
     assert torch.equal(scene.points, again.points)
 
 
-def test_no_such_scene(tmp_path):
-    with pytest.raises(InputError, match="no such scene"):
-        load_scene(tmp_path / "absent")
-
-
 def test_a_model_without_images_is_refused(tmp_path):
     (tmp_path / "sparse/0").mkdir(parents=True)
     pycolmap.Reconstruction().write_binary(tmp_path / "sparse/0")
@@ -478,14 +473,3 @@ def test_rigs(tmp_path):
     assert set(capture.names) == set(expected)
     for name, viewmat in zip(capture.names, capture.viewmats, strict=True):
         np.testing.assert_allclose(viewmat, expected[name], atol=1e-9)
-
-
-def test_names_of_a_model_made_on_windows(tmp_path):
-    """Photos in folders have backslashes in their names there."""
-    folder = write_capture(tmp_path / "cup", nested=True)
-    names = load_scene(folder).train.names
-    model = pycolmap.Reconstruction(folder / "sparse/0")
-    for image in model.images.values():
-        image.name = image.name.replace("/", "\\")
-    model.write_binary(folder / "sparse/0")
-    assert load_scene(folder).train.names == names and names[0].startswith("left/0/")

@@ -196,7 +196,8 @@ def test_a_model_that_cannot_be_read_gives_way_to_other_poses_and_is_said(tmp_pa
     elif trouble == "incomplete":
         (model / "images.bin").unlink()
     scene = load_scene(folder)
-    require_painted(scene)
+    if kind == "transforms":  # LLFF's principal points are in the middle
+        require_painted(scene)
     reason = {"damaged": f"{model / 'images.bin'} is damaged: ", "incomplete": f"{model} has no images.bin: "}
     said = next(note for note in scene.notes if note not in before)
     assert said.startswith(f"not used: {reason.get(trouble, f'{model} names 9 photos, of which 9 are missing')}")

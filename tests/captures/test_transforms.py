@@ -130,15 +130,6 @@ def test_transparency_is_opacity(tmp_path):
         np.testing.assert_allclose(scene.train.photos.image(0, background)[0, 0], expected, atol=0.004)
 
 
-def test_random_points_are_seeded_and_about_what_the_cameras_see(tmp_path):
-    folder = write_transforms(tmp_path / "cup")
-    scene, again = load_scene(folder), load_scene(folder)
-    assert np.array_equal(scene.points, again.points) and len(scene.points) == 50_000
-    points = scene.frame.restore_points(scene.points.numpy())
-    np.testing.assert_allclose(points.mean(axis=0), TARGET, atol=0.05)
-    assert np.ptp(points, axis=0) == pytest.approx([math.sqrt(17)] * 3, rel=1e-2)
-
-
 @pytest.mark.parametrize("body", ["ascii", "binary"])
 def test_points_from_a_ply(tmp_path, body):
     folder = write_transforms(tmp_path / "cup", ply_file_path="sparse_pc.ply")
@@ -262,7 +253,7 @@ def test_paths_of_the_machine_that_wrote_it(tmp_path, written):
     scene = load_scene(folder)
     assert scene.test.names == ("f0.png", "f8.png") and len(scene.train) == 7
     np.testing.assert_allclose(scene.train.photos.image(2)[0, 0] * 255, [30, 200, 30], atol=1e-4)
-    assert "masks of 9 of 9 photos" in scene.notes[1]
+    assert "masks of 9 of 9 photos" in " ".join(scene.notes)
 
 
 def test_a_mark_at_the_beginning_of_the_file(tmp_path):
@@ -310,15 +301,6 @@ def test_an_absent_photo_of_another_machine_is_left_out_like_any(tmp_path, writt
     scene = load_scene(folder)
     assert (*scene.test.names, *scene.train.names) == ("f0.png", *(f"f{view}.png" for view in (1, 2, 3, 4, 6, 8)))
     assert scene.notes[1].startswith("2 of 9 images are left out, their photos do not exist: ")
-
-
-@pytest.mark.parametrize("written", ["images/f{}.jpeg", "/home/me/cup/images/f{}.JPG", "images\\f{}.tif"])
-def test_photos_with_another_suffix(tmp_path, written):
-    folder = write_transforms(tmp_path / "cup", test_filenames=[written.format(3)])
-    edit(folder, lambda content: [f.update(file_path=written.format(i)) for i, f in enumerate(content["frames"])])
-    scene = load_scene(folder)
-    assert scene.test.names == ("f3.png",) and len(scene.train) == 8
-    assert scene.notes[1].startswith("9 photos are not where transforms.json says: images/f0.png is taken for")
 
 
 @pytest.mark.parametrize(

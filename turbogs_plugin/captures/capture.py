@@ -116,9 +116,8 @@ def absence_notes(scene: Path, source: Path, absent: Sequence[str], count: int) 
             f"{source} names {count} photos, of which {len(absent)} are missing in {scene} ({named(absent)}): at "
             f"least {FEWEST_PHOTOS} are needed; copy the photos there"
         )
-    return (
-        [f"{len(absent)} of {count} images are left out, their photos do not exist: {absent[0]}, ..."] if absent else []
-    )
+    note = f"{len(absent)} of {count} images are left out, their photos do not exist: {named(absent, most=1)}"
+    return [note] if absent else []
 
 
 def require_printable(name: str, source: Path) -> None:

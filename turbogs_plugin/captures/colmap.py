@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import re
 import signal
 import threading
@@ -203,10 +202,10 @@ def write_whole(reconstruction: pycolmap.Reconstruction, folder: Path, called: P
         called: the folder's name in the message.
 
     Raises:
-        OSError: the files are not whole.
+        InputError: the files are not whole.
     """
     try:
         reconstruction.write_binary(folder)
         read_model(folder, ".bin")
     except (RuntimeError, ValueError) as error:
-        raise OSError(errno.ENOSPC, "it cannot be written whole", str(called)) from error
+        raise InputError(f"'{called}' cannot be written whole: make room there, or choose another place") from error

@@ -227,13 +227,7 @@ def _write(folder: Path, random: np.random.Generator, views: int, width: int, he
         points.append(origin + distances[chosen, None] * directions[chosen])
         point_colors.append(colors[chosen])
     _fill(reconstruction, poses, np.concatenate(points), np.concatenate(point_colors), depths, focal, random)
-    model = folder / "sparse" / "0"
-    try:
-        write_whole(reconstruction, model, model)
-    except OSError as error:
-        raise InputError(
-            f"the demo capture cannot be written to '{folder.parent}': make room there, or choose another place"
-        ) from error
+    write_whole(reconstruction, folder / "sparse" / "0", folder.parent)
 
 
 def _fill(

@@ -30,8 +30,8 @@ OTHER_IMAGES = re.compile(r"(depth|normal|semantic|segmentation|confidence)s?|.*
 PHOTO_DEPTH = 1
 """Photos are looked for in a folder and in the folders in it. The photos of several captures beside each other lie
 deeper, in the ``images`` of each."""
-FOLDER_DEPTH = 2
-"""Named photos are looked for in folders of folders, no deeper."""
+FOLDER_DEPTH = 4
+"""Named photos are looked for in folders of a capture, no deeper than this."""
 IMAGES, REDUCED = "images", tuple(f"images_{factor}" for factor in (2, 4, 8, 16))
 """Folder of the photos, and of copies reduced by a factor."""
 
@@ -119,9 +119,9 @@ def find_named(
     tries = ([_first_there(scene, name, source, place) for name in names] for place in places)
     first = next(tries)
     found = first if _count(first) >= FEWEST_PHOTOS else next((each for each in tries if _count(each)), first)
-    for path, times in Counter(filter(None, found)).items():
-        if times > 1:
-            raise InputError(f"{source} names the photo {path} twice: take one out, or rename the photos")
+    plain = [path or PureWindowsPath(name).as_posix() for path, name in zip(found, names, strict=True)]
+    if twice := [path for path, times in Counter(plain).items() if times > 1]:
+        raise InputError(f"{source} names the photo {twice[0]} twice: take one out, or rename the photos")
     moved: dict[int, str] = {}
     if None in found:
         index = _index(scene, {PurePosixPath(other) for other in others})

@@ -68,11 +68,12 @@ class FrameViews:
     notes: list[str] = field(default_factory=list)
 
 
-def read_frame_views(scene: Path, source: Path, lenses: dict[tuple, Lens]) -> FrameViews:
+def read_frame_views(scene: Path, source: Path, lenses: dict[tuple, Lens], others: Collection[str] = ()) -> FrameViews:
     """The frames of a file. Intrinsics and distortion may stand in each frame or for all.
 
     Args:
         lenses: lenses by their numbers; new ones are added.
+        others: photos that do not stand for missing ones.
 
     Raises:
         InputError: a file that is not such JSON, lacks something or describes no lens; a photo that two frames name.
@@ -81,7 +82,9 @@ def read_frame_views(scene: Path, source: Path, lenses: dict[tuple, Lens]) -> Fr
     if not all(isinstance(frame.get("file_path"), str) for frame in frames):
         raise InputError(f"{source} has a frame without a file_path: export it again")
     texts = {text for frame in frames for key, text in frame.items() if isinstance(text, str) and key != "file_path"}
-    paths, notes = find_named(scene, [frame["file_path"] for frame in frames], source, ("", "images"), texts)
+    paths, notes = find_named(
+        scene, [frame["file_path"] for frame in frames], source, ("", "images"), {*texts, *others}
+    )
     found = FrameViews(content, notes=notes)
     for frame, path in zip(frames, paths, strict=True):
         written = PureWindowsPath(frame["file_path"]).as_posix()
@@ -114,7 +117,8 @@ def read_transforms(scene: Path) -> Capture:
         train, test = split
         views = [view for view in views if view.written in train | test]
         absent = [name for name in absent if name in train | test]
-        tested, unused = sum(view.written in test for view in views), len(found.views) - len(views)
+        tested = sum(view.written in test for view in views)
+        unused = len(found.views) + len(found.absent) - len(views) - len(absent)
         left = f", {unused} others not used" if unused else ""
         words = f", its own split, {len(views) - tested} training and {tested} test photos{left}"
         if not tested:
@@ -142,9 +146,10 @@ def read_blender(scene: Path) -> Capture:
     train = read_frame_views(scene, source, lenses)
     absence_notes(scene, source, train.absent, len(train.views) + len(train.absent))
     test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
-    test = FrameViews() if test_file is None else read_frame_views(scene, test_file, lenses)
+    trained = [view.path for view in train.views]
+    test = FrameViews() if test_file is None else read_frame_views(scene, test_file, lenses, trained)
     names = {view.written for view in test.views}
-    if both := sorted({view.path for view in train.views} & {view.path for view in test.views}):
+    if both := sorted({view.path for view in test.views}.intersection(trained)):
         raise InputError(
             f"{scene}: {len(both)} photos are for training and for testing ({both[0]}): take them out of one"
         )

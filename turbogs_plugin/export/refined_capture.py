@@ -88,10 +88,7 @@ def write_refined(scene: Path, out: Path) -> str:
                 (folder / name).symlink_to(source.resolve(), target_is_directory=True)
             except OSError:  # a disk without links
                 shutil.copytree(source, folder / name)
-        try:
-            write_whole(_reconstruction(*found, capture, refined), folder / MODEL / "0", out)
-        except OSError as error:
-            raise InputError(f"--out '{out}' cannot be written: make room there, or choose another place") from error
+        write_whole(_reconstruction(*found, capture, refined), folder / MODEL / "0", out)
         folder.rename(out)
     return "\n".join([*capture.notes[1:], refined.text("cameras"), f"scene  {out}"])
 
