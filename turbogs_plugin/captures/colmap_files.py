@@ -167,7 +167,7 @@ class _Words:
         """The next numbers, by a layout of the struct module. Names of sensors and camera models count as numbers."""
         codes = (code for count, code in re.findall(r"(\d*)(\D)", layout) for code in code * int(count or 1))
         try:
-            return tuple(_number(next(self.words), code) for code in codes)
+            return tuple([_number(next(self.words), code) for code in codes])
         except (ValueError, KeyError, StopIteration):
             raise _damaged(self.path, f"line {self.line} lacks a number, or has another word in its place") from None
 
