@@ -161,7 +161,7 @@ def frame(**values):
         (lambda content: content.update(camera_angle_x="wide"), "camera_angle_x is 'wide'"),
         (lambda content: content.update(k1=-1e9), "r_0.png is OPENCV with parameters that are not those of a lens"),
         (lambda content: content.update(frames=content["frames"][:2]), "2 training images: at least 3"),
-        (frame(file_path="./train/r_1"), "names the photo train/r_1.png twice"),
+        (frame(file_path="./train/r_1"), "names the photo train/r_1 twice"),
         (frame(file_path="./test/r_1"), r"1 photos are for training and for testing \(test/r_1.png\)"),
         (frame(transform_matrix=np.diag([2, 2, 2, 1]).tolist()), "r_2.png' is not a rotation .* scale of the camera"),
     ],

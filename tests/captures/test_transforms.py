@@ -331,14 +331,17 @@ def test_photos_in_another_folder_are_found_by_their_names(tmp_path, written, li
 
 
 def test_photos_in_another_folder_that_may_be_others_are_not_taken(tmp_path):
-    """A file of which there are two, or that is of two names."""
+    """Where a name has two files, or a file two names."""
     folder = write_transforms(tmp_path / "cup")
     (folder / "images").rename(folder / "old")
     (folder / "rgb").mkdir()
     (folder / "rgb/f2.png").write_bytes((folder / "old/f2.png").read_bytes())
+    missing = r"names 9 photos, of which 9 are missing in .*/cup \(images/f0.png, .*\): at least 3 are needed; copy"
+    assert_refused(missing, load_scene, folder)
+    (folder / "rgb/f2.png").unlink()
+    assert len(load_scene(folder).train) == 7
     edit(folder, lambda content: content["frames"][1].update(file_path="other/f0.png"))
-    said = "3 of 9 images are left out, their photos do not exist: images/f0.png, ..."
-    assert said in load_scene(folder).notes
+    assert_refused(missing, load_scene, folder)
 
 
 def test_neighbours_with_another_suffix_that_are_no_photos(tmp_path):

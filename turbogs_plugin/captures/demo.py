@@ -189,7 +189,7 @@ def write_demo_capture(path: str | Path, seed: int = 0, views: int = 32, width: 
         raise InputError(f"{target} is there already: choose a new folder for the demo capture")
     if views < 3 or width < 1 or height < 1:
         raise InputError(f"the demo capture was asked for {views} views of {width}x{height}: at least 3 of 1x1 needed")
-    load_pycolmap()  # where the module is absent, its error comes before any photo is made
+    reconstruction = load_pycolmap().Reconstruction()  # where the package is absent, or another one, that is said first
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".") as temporary:
         capture = Path(temporary) / "capture"
@@ -199,7 +199,8 @@ def write_demo_capture(path: str | Path, seed: int = 0, views: int = 32, width: 
         random = np.random.default_rng(seed)
         poses = np.stack([orbit_pose(2 * np.pi * view / views) for view in range(views)])  # [V, 3, 4]
         seen = _photograph(capture / "images", random, poses, width, height)
-        write_whole(_reconstruction(poses, *seen, FOCAL * width, random), model, target)
+        _fill(reconstruction, poses, *seen, FOCAL * width, random)
+        write_whole(reconstruction, model, target)
         capture.rename(target)
     return target
 
@@ -236,15 +237,22 @@ def _photograph(
     return np.concatenate(points), np.concatenate(point_colors), depths
 
 
-def _reconstruction(
+def _fill(
+    reconstruction: pycolmap.Reconstruction,
     poses: np.ndarray,
     points: np.ndarray,
     colors: np.ndarray,
     depths: np.ndarray,
     focal: float,
     random: np.random.Generator,
-) -> pycolmap.Reconstruction:
-    """What COLMAP would have made of the photos: the arguments are `_photograph`'s, `focal` is in pixels."""
+) -> None:
+    """Make an empty reconstruction what COLMAP would have made of the photos.
+
+    Args:
+        poses: [V, 3, 4] world to camera.
+        points, colors, depths: as `_photograph` returns them.
+        focal: pixels.
+    """
     views, height, width = depths.shape
     local = np.einsum("vij,mj->vmi", poses[:, :, :3], points) + poses[:, None, :, 3]  # [V, M, 3]
     pixels = local[..., :2] / local[..., 2:] * focal + [width / 2, height / 2]  # [V, M, 2]
@@ -255,7 +263,7 @@ def _reconstruction(
     visible &= visible.sum(axis=0) >= 2
 
     pycolmap = load_pycolmap()
-    reconstruction, params = pycolmap.Reconstruction(), [focal, focal, width / 2, height / 2]
+    params = [focal, focal, width / 2, height / 2]
     camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=width, height=height, params=params)
     reconstruction.add_camera_with_trivial_rig(camera)
     positions = np.cumsum(visible, axis=1) - 1  # [V, M] number of a point among those of its view
@@ -269,4 +277,3 @@ def _reconstruction(
         track = pycolmap.Track([pycolmap.TrackElement(view + 1, positions[view, point]) for view in seen_by])
         reconstruction.add_point3D(displaced[point], track, np.round(colors[point] * 255).astype(np.uint8))
     reconstruction.update_point_3d_errors()
-    return reconstruction

@@ -93,20 +93,28 @@ def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | 
 
 
 def find_named(
-    scene: Path, names: Sequence[str], source: Path, folders: Sequence[str], others: Collection[str] = ()
+    scene: Path,
+    names: Sequence[str],
+    source: Path,
+    folders: Sequence[str],
+    others: Collection[str] = (),
+    anywhere: bool = True,
 ) -> tuple[list[str | None], list[str]]:
     """The photos that a capture names: the one rule for every kind of capture.
 
-    A photo counts that is where its name says (`file_named`), in the first of `folders` that has it; where fewer than
-    `FEWEST_PHOTOS` are, in ``images_2``, ``images_4``, ... Other names stand for a file in the folder that they say, of
-    any suffix and in any letters, or, where there is none for any name, for one in the scene and in folders of it,
-    `FOLDER_DEPTH` deep. Of several such files that one counts that has the name's suffix, then the one whose path ends
-    as the name does; a name stands for none where several are left, or where its file stands for another name. Where
-    photos have neighbours of other suffixes (masks, depths), no other suffix is taken.
+    - A photo counts that is where its name says (`file_named`), in the first of `folders` that has it; where fewer than
+      `FEWEST_PHOTOS` are, in ``images_2``, ``images_4``, ...
+    - Another name stands for a file in the folder that it says, of any suffix and in any letters. Where photos have
+      neighbours of other suffixes (masks, depths), it stands for none.
+    - Where no name is found so, names stand for files in the scene and in folders of it, `FOLDER_DEPTH` deep; for none
+      where a file may be meant by two names, or a name by two files.
+
+    Of several files for a name, one of its suffix counts before others, then one whose path ends as the name does.
 
     Args:
         folders: in the scene, that names are relative to; '' for the scene itself.
         others: names of files that are no photos.
+        anywhere: the last rule is followed.
 
     Returns:
         The photos' paths relative to the scene, None where there is no photo; a note or none on photos that are not
@@ -127,10 +135,10 @@ def find_named(
         index = _index(scene, {PurePosixPath(other) for other in others})
         if not any(len(_like(index, PureWindowsPath(path), [""])) > 1 for path in filter(None, found)):
             missing = {place: PureWindowsPath(names[place]) for place, path in enumerate(found) if path is None}
-            moved = _moved(index, missing, list(folders))
-            moved = moved or ({} if any(found) else _moved(index, missing, None))
-    taken = Counter([*filter(None, found), *moved.values()])
-    moved = {place: path for place, path in moved.items() if taken[path] == 1}
+            moved, _ = _moved(index, missing, folders)
+            if anywhere and not moved and not any(found):
+                moved, clear = _moved(index, missing, None)
+                moved = moved if clear else {}
     paths = [moved.get(place, path) for place, path in enumerate(found)]
     return paths, _moved_note(names, moved, source)
 
@@ -199,17 +207,21 @@ def _like(index: Index, name: PureWindowsPath, folders: Sequence[str] | None) ->
     return list(own)
 
 
-def _moved(index: Index, names: dict[int, PureWindowsPath], folders: Sequence[str] | None) -> dict[int, str]:
-    """The one file that each name may stand for; names of none or several are left out."""
-    moved = {}
+def _moved(
+    index: Index, names: dict[int, PureWindowsPath], folders: Sequence[str] | None
+) -> tuple[dict[int, str], bool]:
+    """The one file that each name stands for, and whether no name has several files, and no file several names."""
+    moved, clear = {}, True
     for place, name in names.items():
         files = _like(index, name, folders)
         files = [file for file in files if _plain(file.name) == _plain(name.name)] or files
         nearest = max((_common_end(file, name) for file in files), default=0)
         files = [file for file in files if _common_end(file, name) == nearest]
+        clear &= len(files) < 2
         if len(files) == 1:
             moved[place] = str(files[0])
-    return moved
+    times = Counter(moved.values())
+    return {place: path for place, path in moved.items() if times[path] == 1}, clear and len(times) == len(moved)
 
 
 def _common_end(file: PurePosixPath, name: PureWindowsPath) -> int:

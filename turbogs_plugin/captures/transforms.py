@@ -68,12 +68,12 @@ class FrameViews:
     notes: list[str] = field(default_factory=list)
 
 
-def read_frame_views(scene: Path, source: Path, lenses: dict[tuple, Lens], others: Collection[str] = ()) -> FrameViews:
+def read_frame_views(scene: Path, source: Path, lenses: dict[tuple, Lens], anywhere: bool = True) -> FrameViews:
     """The frames of a file. Intrinsics and distortion may stand in each frame or for all.
 
     Args:
         lenses: lenses by their numbers; new ones are added.
-        others: photos that do not stand for missing ones.
+        anywhere: photos may lie in other folders than the file says.
 
     Raises:
         InputError: a file that is not such JSON, lacks something or describes no lens; a photo that two frames name.
@@ -82,9 +82,8 @@ def read_frame_views(scene: Path, source: Path, lenses: dict[tuple, Lens], other
     if not all(isinstance(frame.get("file_path"), str) for frame in frames):
         raise InputError(f"{source} has a frame without a file_path: export it again")
     texts = {text for frame in frames for key, text in frame.items() if isinstance(text, str) and key != "file_path"}
-    paths, notes = find_named(
-        scene, [frame["file_path"] for frame in frames], source, ("", "images"), {*texts, *others}
-    )
+    names = [frame["file_path"] for frame in frames]
+    paths, notes = find_named(scene, names, source, ("", "images"), texts, anywhere)
     found = FrameViews(content, notes=notes)
     for frame, path in zip(frames, paths, strict=True):
         written = PureWindowsPath(frame["file_path"]).as_posix()
@@ -143,13 +142,12 @@ def read_blender(scene: Path) -> Capture:
     """
     source = scene / TRAIN_FILE
     lenses: dict[tuple, Lens] = {}
-    train = read_frame_views(scene, source, lenses)
+    train = read_frame_views(scene, source, lenses, anywhere=False)  # each folder has an r_0
     absence_notes(scene, source, train.absent, len(train.views) + len(train.absent))
     test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
-    trained = [view.path for view in train.views]
-    test = FrameViews() if test_file is None else read_frame_views(scene, test_file, lenses, trained)
+    test = FrameViews() if test_file is None else read_frame_views(scene, test_file, lenses, anywhere=False)
     names = {view.written for view in test.views}
-    if both := sorted({view.path for view in test.views}.intersection(trained)):
+    if both := sorted({view.path for view in train.views} & {view.path for view in test.views}):
         raise InputError(
             f"{scene}: {len(both)} photos are for training and for testing ({both[0]}): take them out of one"
         )
