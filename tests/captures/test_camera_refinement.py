@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers.tracked import HEIGHT, WIDTH, tracked, write_tracked
 
-from turbogs_plugin.captures import load_scene, write_demo_capture
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.bundle_adjustment import reprojection_errors
 from turbogs_plugin.captures.camera_refinement import _pinholes, load_and_find, refine_cameras
 from turbogs_plugin.config.configuration import load_config
@@ -104,24 +104,19 @@ def test_training_photos_tell_how_far_the_camera_of_a_test_photo_may_be(tmp_path
     assert (refined.refined.Ks - refined.cameras.Ks).abs().max() < 0.4
 
 
-def test_a_capture_that_does_not_say_it_stays_as_it_is(tmp_path):
-    scene = load_scene(write_demo_capture(tmp_path / "demo", views=8, width=48, height=40))
-    scene = replace(scene, train=replace(scene.train, observations=None), test=replace(scene.test, observations=None))
-    assert refine_cameras(scene) is scene and refine_cameras(scene, training=False) is scene
-
-
 def test_photos_that_show_little_change_nothing(tmp_path):
     scene = load_scene(write_tracked(tmp_path / "cup", tracked(points=20)))
     refined = refine_cameras(scene)
     assert unchanged(scene, refined, "train") and refined.points is scene.points and refined.notes == scene.notes
 
 
-def test_observations_of_other_photos_are_not_used(capture):
-    """A reconstruction whose cameras were edited by hand for photos of another size."""
+@pytest.mark.parametrize("other", [True, False])
+def test_observations_of_other_photos_are_not_used(capture, other):
+    """A reconstruction whose cameras were edited by hand for photos of another size, or that does not say any."""
     scene = load_scene(capture)
-    other = replace(scene.train.observations, pixels=2.0 * scene.train.observations.pixels)
-    scene = replace(scene, train=replace(scene.train, observations=other))
-    assert refine_cameras(scene) is scene
+    observations = replace(scene.train.observations, pixels=2.0 * scene.train.observations.pixels) if other else None
+    scene = replace(scene, train=replace(scene.train, observations=observations))
+    assert refine_cameras(scene) is scene and refine_cameras(scene, training=False) is scene
 
 
 def test_errors_by_refined_test_cameras_stand_beside_the_others(capture):

@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pycolmap
 import pytest
 import torch
 from helpers.refusals import assert_refused
-from PIL import ExifTags, Image
+from PIL import Image
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import find_model, read_colmap
@@ -161,20 +162,6 @@ def wrong_size(folder: Path) -> None:
     Image.new("RGB", (24, 40)).save(folder / "images" / "photo03.png")
 
 
-def turned_photo(folder: Path) -> None:
-    orientation = Image.Exif()
-    orientation[ExifTags.Base.Orientation] = 6
-    Image.new("RGB", (24, 40)).save(folder / "images" / "photo03.png", exif=orientation)
-
-
-def spoilt_text(folder: Path) -> None:
-    pycolmap.Reconstruction(folder / "sparse/0").write_text(folder / "sparse/0")
-    for file in (folder / "sparse/0").glob("*.bin"):
-        file.unlink()
-    images = folder / "sparse/0/images.txt"
-    images.write_text(images.read_text().replace("photo03.png", "photo03.png\nx y"))
-
-
 def deep_photo(folder: Path) -> None:
     Image.fromarray(np.full((24, 40), 3000, dtype=np.uint16)).save(folder / "images" / "photo03.png")
 
@@ -184,34 +171,20 @@ def remove_photos(folder: Path) -> None:
         (folder / "images" / f"photo{view:02d}.png").unlink()
 
 
-def capitals(folder: Path) -> None:
-    for path in list((folder / "images").iterdir()):
-        path.rename(path.with_suffix(".PNG"))
-
-
 def remove_model(folder: Path) -> None:
     (folder / "sparse/0/points3D.bin").unlink()
-
-
-def remove_most_of_the_model(folder: Path) -> None:
-    remove_model(folder)
-    (folder / "sparse/0/images.bin").unlink()
 
 
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (remove_model, r"has no points3D\.bin: bring back what is missing, or delete that folder and find"),
-        (remove_most_of_the_model, r"sparse/0 has no images\.bin and no points3D\.bin: bring back"),
-        (capitals, r"9 of 9 photos are missing in .*; photo00\.PNG is there: give the files the letters"),
-        (remove_photos, r"7 of 9 photos are missing in .*images: photo02.png, photo03.png, photo04.png, \.\.\.; bring"),
+        (remove_model, r"has no points3D\.bin: bring back what is missing, or take that folder away and find"),
+        (remove_photos, r"sparse/0 names 9 photos, of which 7 are missing in .*cup \(photo02.png, .*\): at least 3"),
         (lambda folder: replace_photo(folder, b"\xff"), "cannot read the photo .*photo03.png"),
         (lambda folder: replace_photo(folder, b""), "cannot read the photo .*photo03.png"),
         (truncate_photo, "cannot read the photo .*photo03.png"),
         (wrong_size, "photo03.png is 24x40 but its camera is 40x24: it was cropped or turned"),
-        (turned_photo, "photo03.png is 24x40 but its camera is 40x24: its EXIF orientation turns it, .*-auto-orient"),
         (deep_photo, "photo03.png has more than 8 bits a channel"),
-        (spoilt_text, r"images\.txt is damaged: line \d+ is not the features of an image: .*; copy or reconstruct"),
     ],
 )
 def test_bad_files_are_named(tmp_path, damage, words):
@@ -250,22 +223,11 @@ def test_without_points_random_ones_are_drawn(tmp_path):
     assert torch.equal(scene.points, again.points)
 
 
-def test_no_such_scene(tmp_path):
-    with pytest.raises(InputError, match="no such scene"):
-        load_scene(tmp_path / "absent")
-
-
 def test_a_model_without_images_is_refused(tmp_path):
     (tmp_path / "sparse/0").mkdir(parents=True)
     pycolmap.Reconstruction().write_binary(tmp_path / "sparse/0")
     with pytest.raises(InputError, match="no images with a pose"):
         load_scene(tmp_path)
-
-
-def test_a_reconstruction_without_any_file_beside_photos(tmp_path):
-    folder = write_capture(tmp_path / "cup")
-    shutil.rmtree(folder / "sparse/0")
-    assert_refused("9 photos and no reconstruction in .*sparse: bring its files .*'turbogs reco", load_scene, folder)
 
 
 def test_the_alpha_of_a_photo_is_a_mask(tmp_path):
@@ -276,7 +238,7 @@ def test_the_alpha_of_a_photo_is_a_mask(tmp_path):
     photo.save(folder / "images" / "photo01.png")
     scene = load_scene(folder)
     train = scene.train
-    assert scene.notes[-1] == "1 photos have masked pixels by their alpha, 25.0% of them"
+    assert scene.notes[-1] == "1 photos have masked pixels, 25.0% of them"
     assert train.photos.image(0)[10, 0].mul(255).tolist() == [200, 100, 50]
     expected = np.zeros((24, 40), dtype=bool)
     expected[6:] = True
@@ -312,7 +274,7 @@ def test_of_several_models_the_largest_is_taken_and_said(tmp_path):
     assert re.fullmatch("COLMAP reconstruction .*sparse/1 .binary.: 9 images, 20 points", scene.notes[0])
 
 
-@pytest.mark.parametrize("place", [".", "photos", "images/full/jpg", "../images", "rgb/left"])
+@pytest.mark.parametrize("place", [".", "photos", "rgb/left"])
 def test_photos_in_other_folders(tmp_path, place):
     folder = write_capture(tmp_path / "captures" / "cup", nested=True)
     (folder / "images").rename(tmp_path / "photos")
@@ -337,7 +299,7 @@ def test_copies_that_the_cameras_were_reconstructed_from(tmp_path):
     assert len(load_scene(folder).train) == 7
     for photo in list((folder / "images_4").iterdir())[2:]:
         photo.unlink()
-    with pytest.raises(InputError, match=r"7 of 9 photos are missing in .*images_4: .*; bring them back"):
+    with pytest.raises(InputError, match=r"of which 7 are missing"):
         load_scene(folder)
 
 
@@ -367,17 +329,7 @@ def test_a_point_that_is_too_far_for_float32_is_refused(tmp_path, place, refused
         load_scene(folder)
 
 
-def test_photos_of_a_capture_beside_it_do_not_stand_in_for_some(tmp_path):
-    """All of them may lie beside the capture; a part may be others of the same names."""
-    folder = write_capture(tmp_path / "cup")
-    (folder / "images").rename(tmp_path / "images")
-    assert len(load_scene(folder).train) == 7
-    (tmp_path / "images" / "photo03.png").unlink()
-    with pytest.raises(InputError, match=r"9 of 9 photos are missing in .*cup/images: .*bring them back"):
-        load_scene(folder)
-
-
-@pytest.mark.parametrize("other", ["depth", "normals", "segmentation", "images_backup", "images_2", "../images"])
+@pytest.mark.parametrize("other", ["depth", "normals", "segmentation", "images_backup", "images_2"])
 @pytest.mark.parametrize("kept", [3, 8])
 def test_where_photos_were_taken_away_no_other_folder_stands_in(tmp_path, other, kept):
     """It has images of all names, which may be depth maps, copies or another capture's photos."""
@@ -386,7 +338,7 @@ def test_where_photos_were_taken_away_no_other_folder_stands_in(tmp_path, other,
     for photo in sorted((folder / "images").iterdir())[: 9 - kept]:
         photo.unlink()
     capture = read_colmap(folder, *find_model(folder))
-    assert capture.photo_folder == folder / "images" and len(capture.names) == kept and capture.reduction == 1
+    assert capture.photo_folder == folder / "images" and len(capture.names) == kept
     assert capture.notes[1].startswith(f"{9 - kept} of 9 images are left out, ")
 
 
@@ -394,7 +346,7 @@ def test_where_photos_were_taken_away_no_other_folder_stands_in(tmp_path, other,
 def test_images_that_are_no_photos_do_not_stand_in_for_all(tmp_path, other):
     folder = write_capture(tmp_path / "cup")
     (folder / "images").rename(folder / other)
-    with pytest.raises(InputError, match=r"9 of 9 photos are missing in .*cup/images: .*bring them back"):
+    with pytest.raises(InputError, match="of which 9 are missing"):
         load_scene(folder)
 
 
@@ -419,6 +371,44 @@ def test_a_name_of_a_text_model_that_is_not_utf_8_is_refused(tmp_path):
     images.write_bytes(images.read_bytes().replace(b"photo03.png", b"ph\xf6to03.png"))
     words = r"sparse/0: image name 'ph\\udcf6to03.png' has signs that cannot be printed: rename the photo"
     assert_refused(words, load_scene, folder)
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        "{}.PNG",
+        "{}.jpg",
+        "./{}.png",
+        "images/{}.png",
+        "/home/me/cup/images/{}.png",
+        "C:\\cup\\images\\{}.png",
+        "../cup/{}.png",
+    ],
+)
+def test_names_of_other_programs_and_machines(tmp_path, written):
+    """Suffix and letters, folders before the name, absolute or Windows' paths: the one rule of all captures."""
+    folder = write_capture(tmp_path / "cup")
+    right = load_scene(folder)
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    for image in model.images.values():
+        image.name = written.format(image.name[:-4])
+    model.write_binary(folder / "sparse/0")
+    scene = load_scene(folder)
+    assert scene.train.names == right.train.names and torch.equal(scene.train.photos.colors, right.train.photos.colors)
+    assert torch.equal(scene.train.cameras.viewmats, right.train.cameras.viewmats)
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_names_in_both_forms_of_unicode(tmp_path, form):
+    folder = write_capture(tmp_path / "cup")
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    other = "NFD" if form == "NFC" else "NFC"
+    for image in model.images.values():
+        name = image.name.replace("photo", "fot\u00f3")
+        (folder / "images" / image.name).rename(folder / "images" / unicodedata.normalize(form, name))
+        image.name = unicodedata.normalize(other, name)
+    model.write_binary(folder / "sparse/0")
+    assert len(load_scene(folder).train) == 7
 
 
 @pytest.mark.parametrize(("size", "fits"), [((20, 12), True), ((21, 12), True), ((80, 48), True), ((20, 15), False)])
@@ -483,14 +473,3 @@ def test_rigs(tmp_path):
     assert set(capture.names) == set(expected)
     for name, viewmat in zip(capture.names, capture.viewmats, strict=True):
         np.testing.assert_allclose(viewmat, expected[name], atol=1e-9)
-
-
-def test_names_of_a_model_made_on_windows(tmp_path):
-    """Photos in folders have backslashes in their names there."""
-    folder = write_capture(tmp_path / "cup", nested=True)
-    names = load_scene(folder).train.names
-    model = pycolmap.Reconstruction(folder / "sparse/0")
-    for image in model.images.values():
-        image.name = image.name.replace("/", "\\")
-    model.write_binary(folder / "sparse/0")
-    assert load_scene(folder).train.names == names and names[0].startswith("left/0/")

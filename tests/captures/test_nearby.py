@@ -38,24 +38,17 @@ def refusal(path: Path) -> str:
 @pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json", "poses_bounds.npy"])
 def test_photos_of_a_capture(tmp_path, name):
     capture = with_poses(tmp_path / "a/b/capture", name)
-    said = f"lies in the capture {capture} ({capture / name}): give that folder"
-    assert refusal(capture / "images") == f"{capture / 'images'} {said}"
     shutil.copytree(capture / "images", capture / "photos/left")
-    assert refusal(capture / "photos/left") == f"{capture / 'photos/left'} {said}"
-    assert refusal(capture / "images/0.png") == f"{capture / 'images/0.png'} {said}"
-    assert refusal(capture / name) == f"{capture / name} lies in the capture {capture}: give that folder"
+    for part in ("images", "photos/left", "images/0.png", name):
+        assert refusal(capture / part) == f"{capture / part} lies in the capture {capture} ({name}): give that folder"
 
 
 def test_photos_of_a_colmap_capture(capture, monkeypatch):
-    said = f"lies in the capture {capture} ({capture / 'sparse/0'}): give that folder"
-    for part in ("images", "sparse/0/images.bin"):
-        assert refusal(capture / part) == f"{capture / part} {said}"
-    assert refusal(capture / "sparse/0") == f"{capture / 'sparse/0'} lies in the capture {capture}: give that folder"
-    assert len(load_scene(capture / "sparse").train) == 7  # its photos are in images beside it
-    monkeypatch.chdir(capture)
-    assert refusal(Path("images")) == "images lies in the capture . (sparse/0): give that folder"
+    for part in ("images", "sparse", "sparse/0", "sparse/0/images.bin"):
+        said = f"{capture / part} lies in the capture {capture} (sparse/0): give that folder"
+        assert refusal(capture / part) == said
     monkeypatch.chdir(capture / "images")
-    assert refusal(Path()) == f". {said}"
+    assert refusal(Path()) == f". lies in the capture {capture} (sparse/0): give that folder"
 
 
 @pytest.mark.parametrize("place", ["inner", "datasets/plush"])
@@ -77,14 +70,11 @@ def test_photos_with_their_own_reconstruction_in_them_are_alone(tmp_path):
         load_scene(photos)
 
 
-def test_of_several_captures_in_a_folder_a_line_names_those_that_are_not_read(capture):
-    """Each with its own sparse/0: the first one is read."""
-    root = capture.parent
-    shutil.copytree(capture, root / "second")
-    shutil.copytree(capture, root / "third")
-    others = f"{root / 'second/sparse'}, {root / 'third/sparse'} not used: give the folder of the capture that you want"
-    assert others in load_scene(root).notes
-    assert not any("not used" in note for note in load_scene(root / "second").notes)
+def test_of_several_captures_in_a_folder_a_line_names_all(capture):
+    other = shutil.copytree(capture, capture.parent / "second")
+    first, second = sorted([capture, other])
+    said = f"{first} has a sparse/0, {second} has a sparse/0: give one of these folders"
+    assert refusal(capture.parent) == said
 
 
 @pytest.mark.parametrize("part", ["model.ply", "checkpoints", "report"])
@@ -98,10 +88,8 @@ def test_a_run_is_no_folder_of_photos(tmp_path, part):
         (run / part).mkdir()
     assert holds_photos_alone(run)
     (run / "config.yaml").write_text("scene: {path: /data/cup}\n")
-    said = f"{run} is a run's folder, not a capture: give /data/cup, which it was trained on"
+    said = f"{run} is a run's folder: give the capture that it was trained on, which its config.yaml names"
     assert refusal(run) == said
     with pytest.raises(InputError) as refused:
         list_photos(run)
     assert str(refused.value) == said
-    (run / "config.yaml").write_text("scene: cup\n")  # another program's
-    assert holds_photos_alone(run)

@@ -205,31 +205,6 @@ def test_transforms_photos_are_those_of_a_pinhole(tmp_path, content, model, para
     require_straight(load_scene(folder))
 
 
-@pytest.mark.parametrize("alpha", [False, True])
-def test_files_of_blenders_kind_with_a_lens(tmp_path, alpha):
-    """As TensoRF's own data are written, by colmap2nerf: undistorted, with the split of the files."""
-    coefficients = [0.12, -0.05, 0.004, -0.003]
-    photo = bent_photo("OPENCV", [260.0, 270.0, 163.0, 117.0, *coefficients])
-    if alpha:
-        photo = np.concatenate([photo, np.full((HEIGHT, WIDTH, 1), 255, dtype=np.uint8)], axis=2)
-        photo[:20, :, 3] = 0
-    numbers = opencv_content(dict(zip(("k1", "k2", "p1", "p2"), coefficients, strict=True)))
-    folder = write_transforms(tmp_path / "cup", photo, views=5, **numbers)
-    content = json.loads((folder / "transforms.json").read_text())
-    (folder / "transforms.json").unlink()
-    for part, frames in (("train", content["frames"][:3]), ("test", content["frames"][3:])):
-        (folder / f"transforms_{part}.json").write_text(json.dumps({**content, "frames": frames}))
-    scene = load_scene(folder)
-    assert scene.test.names == ("images/3.png", "images/4.png") and len(scene.train) == 3
-    assert "3 training and 2 test photos 320x240" in scene.notes[0] and ("RGBA" in scene.notes[0]) == alpha
-    width, height = scene.train.cameras.sizes[0]
-    assert scene.notes[1] == f"5 photos undistorted: OPENCV 320x240 -> PINHOLE {width}x{height}"
-    if alpha:  # opacity
-        assert scene.train.photos.transparent and scene.train.masks is None
-    else:
-        require_straight(scene)
-
-
 def test_a_fourth_radial_coefficient_is_a_power_as_in_nerfstudio():
     points = np.random.default_rng(0).uniform(-0.6, 0.6, (50, 2))
     squared = (points**2).sum(axis=1)
@@ -287,12 +262,6 @@ def test_reduced_photos_are_undistorted(tmp_path, copies):
     scene, full = load_scene(folder, factor=2), load_scene(folder)
     assert (np.abs(scene.train.cameras.sizes - full.train.cameras.sizes / 2) <= 0.5).all()
     require_straight(scene, levels=6.0)  # an average over 2x2 pixels is not the colour in their middle
-
-
-def test_undistorted_colors_are_rounded_to_the_nearest():
-    photo = np.random.default_rng(0).integers(100, 104, (HEIGHT, WIDTH, 3)).astype(np.uint8)
-    lens = lens_of_camera(camera("RADIAL", [260.0, 163.0, 117.0, -0.1, 0.0]), "a camera")
-    assert lens.undistort(photo, lens.size).mean() == pytest.approx(photo.mean(), abs=0.05)
 
 
 def test_a_zero_distortion_changes_no_pixel(tmp_path):

@@ -236,7 +236,7 @@ def test_a_full_disk_is_told(given, tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
     try:
-        assert_refused("--out .*new' cannot be written: make room there", write_refined, given, tmp_path / "new")
+        assert_refused("new' cannot be written whole: make room there", write_refined, given, tmp_path / "new")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert not list(tmp_path.iterdir())

@@ -28,7 +28,6 @@ from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, 
 from turbogs_plugin.train.given_model import load_given
 from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.types import Gaussians
-from turbogs_plugin.yaml_json import parse_yaml
 
 MEMORY = 64 * 2**20
 """Python and numpy may allocate this much for files of less than a megabyte."""
@@ -126,23 +125,7 @@ def test_damaged_checkpoints(finished, tmp_path):
     assert refused > 100
 
 
-def test_a_run_whose_history_is_gone_is_finished(finished, tmp_path):
-    folder = shutil.copytree(finished, tmp_path / "run")
-    (folder / "history.jsonl").unlink()
-    assert [evaluation.iteration for evaluation in run.resume(folder).history] == [3]
-
-
 # ---- Text --------------------------------------------------------------------------------------------------------
-
-
-def test_damaged_configurations():
-    text = load_config("turbogs").to_yaml().encode()
-    choice, refused = random.Random(5), 0
-    for _ in range(60):
-        changed = damaged(text, choice).decode("utf-8", "replace")
-        result = outcome_within(MEMORY, parse_yaml, changed, "config")
-        refused += isinstance(result, InputError)
-    assert 6 < refused < 60
 
 
 BOMBS = {

@@ -6,7 +6,6 @@ from __future__ import annotations
 import copy
 import json
 import random
-import shutil
 import struct
 import warnings
 from pathlib import Path
@@ -180,22 +179,3 @@ def test_not_finite_in_a_start(scene, capture, tmp_path, suffix, broken):
     else:
         assert len(result) == 19
         require_whole_model(result)
-
-
-@pytest.mark.parametrize("kind", ["transforms", "colmap"])
-def test_no_points(capture, photos, tmp_path, kind):
-    """Points are drawn at random, the same each time; training starts from them."""
-    if kind == "transforms":
-        empty = (photos / "points.ply").read_text().replace("vertex 2", "vertex 0").split("end_header")[0]
-        (photos / "points.ply").write_text(empty + "end_header\n")
-        (photos / "transforms.json").write_text(json.dumps({**FILES["points"][1], "frames": frames("images", 5)}))
-        folder = photos
-    else:
-        folder = Path(shutil.copytree(capture, tmp_path / "copy"))
-        (folder / "sparse/0/points3D.bin").write_bytes(bytes(8))
-    found = load_scene(folder)
-    require_whole(found)
-    assert len(found.points) == 50_000 and "so 50,000 random ones" in found.notes[0]
-    gaussians = initial_gaussians(found, tiny_config(folder, "density.max_gaussians=300").without_plan(), "points")
-    assert len(gaussians) == 300
-    require_whole_model(gaussians)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from functools import partial
 from pathlib import Path
@@ -16,10 +15,11 @@ from turbogs_plugin.captures.decoding import photo_size
 from turbogs_plugin.captures.undistort import Lens, brown_projection, lens_of_camera
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import viewmat_of_pose
+from turbogs_plugin.yaml_json import parse_json
 
 BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 """Names of one model, whose missing coefficients are 0."""
-FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+FISHEYE = "OPENCV_FISHEYE"
 MATRICES = ("K", "intrinsic_matrix")
 """Keys of intrinsics as a matrix, of which NeuS2 writes the second."""
 LARGEST_SKEW = 0.5
@@ -29,10 +29,10 @@ LARGEST_SKEW = 0.5
 def read_frames(source: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """A transforms file, and its frames. Raises `InputError` unless it is JSON with a list of frames."""
     try:
-        content = json.loads(source.read_text(encoding="utf-8-sig"))  # Windows' editors write a mark at its beginning
-    except (OSError, ValueError, RecursionError) as error:
-        reason = " ".join((getattr(error, "strerror", None) or str(error)).split())[:200]
-        raise InputError(f"{source} is not readable JSON: {reason}; export or copy it again") from error
+        text = source.read_text(encoding="utf-8-sig")  # Windows' editors write a mark at its beginning
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {source} ({str(error)[:200]}): export or copy it again") from error
+    content = parse_json(text, str(source))
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{source} has no list of frames: export it again")
@@ -58,27 +58,35 @@ def read_camera(
         values: the frame's own, before the file's for all frames.
         lenses: those already made, by their numbers; a new one is added.
     """
-    K, size = _intrinsics(values, photo, source)
-    number = partial(number_of, values, source)
-    model = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") is True else "OPENCV")
-    if model not in (*BROWN_MODELS, *FISHEYE_MODELS):
+    number, owner = partial(number_of, values, source), f"{source}: the camera of {photo.name}"
+    width, height = number("w"), number("h")
+    if width is None or height is None:
+        width, height = photo_size(photo)
+    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
+        raise InputError(f"{owner} is {width:g}x{height:g} pixels: write the photo's size as w and h, or take them out")
+    K, size = pinhole(values, source, (width, height)), (round(width), round(height))
+    if K is None:
         raise InputError(
-            f"{source}: the camera_model of {photo.name} is {str(model)[:40]!r}: known are "
-            f"{', '.join((*BROWN_MODELS, *FISHEYE_MODELS))}; convert the capture with ns-process-data, or use its "
-            "COLMAP reconstruction"
+            f"{owner} has neither fl_x nor a camera_angle_x in 0 .. pi: write one of them there (pixels, radians), or "
+            "find the cameras anew by 'turbogs reconstruct' on a folder of the photos alone"
         )
-    fisheye = model in FISHEYE_MODELS
+    model = values.get("camera_model", FISHEYE if values.get("is_fisheye") is True else "OPENCV")
+    if model not in (*BROWN_MODELS, FISHEYE):
+        raise InputError(
+            f"{owner} is a {str(model)[:40]!r}: known are {', '.join((*BROWN_MODELS, FISHEYE))}; convert the capture "
+            "with ns-process-data, or use its COLMAP reconstruction"
+        )
+    fisheye = model == FISHEYE
     bends = tuple(number(key, 0.0) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if unknown := [key for key in ("k5", "k6", *(("p1", "p2") if fisheye else ())) if number(key, 0.0)]:
         raise InputError(
-            f"{source}: the {model} camera of {photo.name} has {' and '.join(unknown)}, which the model does not have: "
-            "use the capture's COLMAP reconstruction"
+            f"{owner} has {' and '.join(unknown)}, which {model} does not have: use the capture's COLMAP reconstruction"
         )
     if not (fisheye or any(bends)):
         return K, size, None
     key = (fisheye, size, *K.ravel().tolist(), *bends)
     if key not in lenses:
-        lenses[key] = _make_lens(fisheye, size, K, bends, f"{source}: the camera of {photo.name}")
+        lenses[key] = _make_lens(fisheye, size, K, bends, owner)
     return lenses[key].K, lenses[key].size, lenses[key]
 
 
@@ -88,34 +96,13 @@ def _make_lens(fisheye: bool, size: tuple[int, int], K: np.ndarray, bends: tuple
     pinhole = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
     model, params = "OPENCV", [*pinhole, k1, k2, p1, p2]
     if fisheye:
-        model, params = "OPENCV_FISHEYE", [*pinhole, *bends[:4]]
+        model, params = FISHEYE, [*pinhole, *bends[:4]]
     elif k3 or k4:
         model, params = "FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
     camera = load_pycolmap().Camera(model=model, width=size[0], height=size[1], params=params)
     # As nerfstudio has it: COLMAP's models, and OpenCV's own fourth coefficient, are other polynomials.
     fourth = None if fisheye or not k4 else brown_projection(pinhole[:2], pinhole[2:], bends[:4], p1, p2)
     return lens_of_camera(camera, owner, fourth)
-
-
-def _intrinsics(values: dict, photo: Path, source: Path) -> tuple[np.ndarray, tuple[int, int]]:
-    """[3, 3] float64 and (width, height) of one frame's photo, as taken."""
-    number = partial(number_of, values, source)
-    width, height = number("w"), number("h")
-    if width is None or height is None:
-        width, height = photo_size(photo)
-    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
-        raise InputError(
-            f"{source}: the size of {photo.name} is {width:g}x{height:g} pixels: write the photo's as w and h, or take "
-            "them out"
-        )
-
-    K = pinhole(values, source, (width, height))
-    if K is None:
-        raise InputError(
-            f"{source}: the camera of {photo.name} has neither fl_x nor a camera_angle_x in 0 .. pi: write one of them "
-            "there (pixels, radians), or find the cameras anew by 'turbogs reconstruct' on a folder of the photos alone"
-        )
-    return K, (round(width), round(height))
 
 
 def pinhole(values: dict, source: Path, size: tuple[float, float], angles: str = "xy") -> np.ndarray | None:
@@ -143,36 +130,36 @@ def pinhole(values: dict, source: Path, size: tuple[float, float], angles: str =
 
 def _matrix(values: dict, key: str, source: Path) -> np.ndarray:
     """[3, 3] float64 of a frame's intrinsics, which are the rows of a matrix, 3x3 or 4x4."""
-    what = f"{source}: {key} of {str(values.get('file_path', 'a camera'))[:80]}"
     try:
         K = np.array(values[key], dtype=np.float64)
     except (ValueError, TypeError, OverflowError):
         K = np.empty(0)
-    if K.shape not in ((3, 3), (4, 4)) or not np.isfinite(K).all():
-        raise InputError(f"{what} is {str(values[key])[:40]!r}: it must be 3x3 or 4x4 finite numbers")
-    rest = K - np.eye(len(K))
-    rest[[0, 1], [0, 1]] = rest[:2, 2] = 0.0
-    if not (K[[0, 1], [0, 1]] > 0).all() or abs(rest[0, 1]) > LARGEST_SKEW or np.abs(np.delete(rest, 1)).max() > 1e-6:
+    rest = K.copy()
+    if fits := K.shape in ((3, 3), (4, 4)) and bool(np.isfinite(K).all()):
+        rest -= np.eye(len(K))
+        rest[[0, 1], [0, 1]] = rest[:2, 2] = 0.0
+        fits = bool((K[[0, 1], [0, 1]] > 0).all()) and abs(rest[0, 1]) <= LARGEST_SKEW
+    if not fits or np.abs(np.delete(rest, 1)).max() > 1e-6:
         raise InputError(
-            f"{what} is {str(values[key])[:80]}: it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], with positive focal "
-            "lengths fx and fy"
+            f"{source}: {key} is {str(values[key])[:80]!r}: it must be finite numbers [[fx, 0, cx], [0, fy, cy], "
+            "[0, 0, 1]], with positive focal lengths fx and fy"
         )
     return np.array([[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
 
 
-def opengl_viewmat(matrix: Any, absent: str, wrong: str, remedy: str = "") -> np.ndarray:
+def opengl_viewmat(matrix: Any, owner: str) -> np.ndarray:
     """[4, 4] float64 world to camera, of a camera-to-world matrix in OpenGL's axes.
 
     Raises:
-        InputError: `absent`, where that is no matrix of numbers; `wrong`, what is wrong with it, and `remedy`.
+        InputError: it is no matrix of 4x4 finite numbers, or no rotation and translation; `owner` names it.
     """
     try:
         pose = np.array(matrix, dtype=np.float64)
     except (ValueError, TypeError, OverflowError):
         pose = np.empty(0)
     if pose.shape not in ((3, 4), (4, 4)):
-        raise InputError(absent)
+        raise InputError(f"{owner} is no matrix of 4x4 numbers: export it again")
     try:
         return viewmat_of_pose(pose[:3, :3] * [1.0, -1.0, -1.0], pose[:3, 3])
     except ValueError as error:
-        raise InputError(f"{wrong} {error}{remedy}") from None
+        raise InputError(f"{owner} {error}: export it again, without a scale of the camera") from None

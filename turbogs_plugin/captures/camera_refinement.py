@@ -92,13 +92,12 @@ def load_and_find(
     factor: int = 1,
     test_every: int = 8,
     progress: Callable[[int, int], object] | None = None,
-    sized: Callable[[np.ndarray, np.ndarray], object] | None = None,
     find: bool = True,
 ) -> tuple[Scene, RefinedCameras | None]:
     """A scene, and the cameras that `find_cameras` finds while its photos are decoded.
 
     Args:
-        path, factor, test_every, progress, sized: as for `load_scene`.
+        path, factor, test_every, progress: as for `load_scene`.
         find: False: no cameras are looked for.
 
     Raises:
@@ -106,7 +105,7 @@ def load_and_find(
     """
     found: list[RefinedCameras | None] = []
     meanwhile = (lambda *posed: found.append(find_cameras(*posed))) if find else None
-    scene = load_scene(path, factor, test_every, progress, sized, meanwhile)
+    scene = load_scene(path, factor, test_every, progress, meanwhile)
     return scene, found[0] if found else None
 
 

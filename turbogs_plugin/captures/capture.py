@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -39,7 +39,6 @@ class Capture:
         lenses: one a view, None for a pinhole camera; given as empty where all are.
         notes: what the capture was taken for, and what was done with it: lines for the user.
         test: [V] bool, the test views of the capture's own split; None: views are split by their order.
-        reduction: the photos are already smaller than the capture's full size by this factor.
         alpha: what the alpha of a transparent photo is: the object's ``opacity``, so that the background shows through
             and training makes the model as transparent; or a ``mask``, whose zero pixels are ignored.
         mask_files: files of masks that the capture names, one a view or None; given as empty where it names none.
@@ -57,7 +56,6 @@ class Capture:
     lenses: tuple[Lens | None, ...] = ()
     notes: tuple[str, ...] = ()
     test: np.ndarray | None = None
-    reduction: int = 1
     alpha: Literal["opacity", "mask"] = "opacity"
     mask_files: tuple[Path | None, ...] = ()
     observations: Observations | None = None
@@ -104,38 +102,25 @@ def named(names: Sequence[str], most: int = 3) -> str:
     return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
 
 
-def left_out(absent: Sequence[str], count: int, called: str) -> str:
-    """The note where `absent` photos of `count` do not exist; `called` is what the capture has of each."""
-    return f"{len(absent)} of {count} {called} are left out, their photos do not exist: {absent[0]}, ..."
-
-
-def require_enough(scene: Path, source: Path, absent: Sequence[str], count: int, unclear: str = "") -> None:
-    """Raise `InputError` where photos of a file's `count` frames do not exist and fewer than `FEWEST_PHOTOS` remain.
+def absence_notes(scene: Path, source: Path, absent: Sequence[str], count: int) -> list[str]:
+    """A note where photos of the `count` images that a file names do not exist.
 
     Args:
         absent: names of the photos that do not exist.
-        unclear: why they were not found elsewhere.
+
+    Raises:
+        InputError: fewer than `FEWEST_PHOTOS` remain.
     """
     if absent and count - len(absent) < FEWEST_PHOTOS:
         raise InputError(
-            f"{source} names {count} photos, of which {len(absent)} are missing in {scene} ({absent[0]}, ...): at "
-            f"least {FEWEST_PHOTOS} are needed; copy the photos there{unclear}"
+            f"{source} names {count} photos, of which {len(absent)} are missing in {scene} ({named(absent)}): at "
+            f"least {FEWEST_PHOTOS} are needed; copy the photos there"
         )
+    note = f"{len(absent)} of {count} images are left out, their photos do not exist: {named(absent, most=1)}"
+    return [note] if absent else []
 
 
-def check_photo_name(name: str, source: Path) -> str:
-    """The name, with slashes where a Windows machine wrote backslashes, if it can be printed and stays within the photo
-    folder; else `InputError`."""
-    path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
+def require_printable(name: str, source: Path) -> None:
+    """Raise `InputError` where a photo's name cannot be printed; `source` names it."""
     if not name.isprintable():
         raise InputError(f"{source}: image name {name!r} has signs that cannot be printed: rename the photo")
-    if not path.parts or ".." in path.parts or path.drive or path.root:
-        raise InputError(f"{source}: image name {name!r} leaves the photo folder: names must be relative, without '..'")
-    return name.replace("\\", "/")
-
-
-def sizes_text(sizes: np.ndarray) -> str:
-    """Sizes of photos [V, 2] in words: ``800x600``, or the size with fewest and the one with most pixels."""
-    ordered = sizes[np.lexsort((sizes[:, 0], np.prod(sizes, axis=1)))]  # of equally many pixels, the upright one first
-    ends = (f"{width:g}x{height:g}" for width, height in ordered[[0, -1]])
-    return " to ".join(dict.fromkeys(ends))

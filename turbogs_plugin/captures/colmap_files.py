@@ -7,6 +7,7 @@ than its file holds.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,9 +28,8 @@ POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error"
 """A point, without its track."""
 NO_POINT = np.uint64(2**64 - 1)
 TRACK_ELEMENT_BYTES = 8
-SENSORS = ("CAMERA", "IMU")
-CAMERA_SENSOR = 0
-"""Kinds of sensors of a rig, and a camera's number among them."""
+SENSORS = {"CAMERA": 0, "IMU": 1}
+"""Kinds of sensors of a rig."""
 SMALLEST_IMAGE, SMALLEST_CAMERA = 73, 24
 """Bytes of an image with a name of one letter and without features; of a camera without parameters."""
 LONGEST_NAME = 4096
@@ -73,10 +73,15 @@ def read_model(folder: Path, suffix: str) -> ColmapModel:
         InputError: a file is damaged, or an image has a camera that is not there; the line names file and place.
     """
     cameras, images, points = (folder / f"{file}{suffix}" for file in FILES)
+    if absent := [path.name for path in (cameras, images, points) if not path.is_file()]:
+        raise InputError(
+            f"{folder} has no {' and no '.join(absent)}: bring back what is missing, or take that folder away and find "
+            "the cameras by 'turbogs reconstruct'"
+        )
     if suffix == ".bin":
-        model = ColmapModel(_binary_cameras(cameras), list(_binary_images(images)), _binary_points(points))
+        model = ColmapModel(_read_cameras(cameras), list(_binary_images(images)), _binary_points(points))
     else:
-        model = ColmapModel(_text_cameras(cameras), list(_text_images(images)), _text_points(points))
+        model = ColmapModel(_read_cameras(cameras), list(_text_images(images)), _text_points(points))
     for image in model.images:
         if image.camera not in model.cameras:
             raise _damaged(
@@ -111,19 +116,22 @@ def read_poses(folder: Path, suffix: str, model: ColmapModel) -> dict[int, np.nd
     rigs, frames = folder / f"rigs{suffix}", folder / f"frames{suffix}"
     if not (rigs.is_file() and frames.is_file()):
         return poses
-    in_rig: dict[tuple[int, int, int], np.ndarray] = {}
-    known = set()
-    for rig, sensors in _binary_rigs(rigs) if suffix == ".bin" else _text_rigs(rigs):
-        known.add(rig)
-        for (kind, sensor), pose in sensors:
-            in_rig[rig, kind, sensor] = _require_pose(rigs, f"rig {rig}", pose)
-    for frame, rig, pose, members in _binary_frames(frames) if suffix == ".bin" else _text_frames(frames):
-        if rig not in known:
+    in_rig: dict[int, dict[tuple[int, int], np.ndarray]] = {}  # of each rig, its sensors' places but the first one's
+    for record in _records(rigs, 8):
+        rig, count = record.take("II")
+        places = in_rig.setdefault(rig, {})
+        for position in range(count):
+            sensor = record.take("iI")
+            if position and record.take("B")[0]:
+                places[sensor] = _require_pose(rigs, f"rig {rig}", np.array(record.take("7d")))
+    for record in _records(frames, 68):
+        frame, rig, *pose, count = record.take("II7dI")
+        if rig not in in_rig:
             raise _damaged(frames, f"frame {frame} has rig {rig}, which {rigs.name} does not have")
-        from_world = _viewmat(_require_pose(frames, f"frame {frame}", pose))
-        for kind, sensor, image in members:
-            if image in poses and kind == CAMERA_SENSOR:
-                place = in_rig.get((rig, kind, sensor))
+        from_world = _viewmat(_require_pose(frames, f"frame {frame}", np.array(pose)))
+        for kind, sensor, image in (record.take("iIQ") for _ in range(count)):
+            if image in poses and kind == SENSORS["CAMERA"]:
+                place = in_rig[rig].get((kind, sensor))
                 poses[image] = from_world if place is None else _viewmat(place) @ from_world
     return poses
 
@@ -145,79 +153,32 @@ def _viewmat(pose: np.ndarray) -> np.ndarray:
     return viewmat
 
 
-Rigs = Iterator[tuple[int, list[tuple[tuple[int, int], np.ndarray]]]]
-"""Each rig's identifier, and its sensors (kind, identifier) but the reference one, with their poses [7] in the rig."""
-Frames = Iterator[tuple[int, int, np.ndarray, list[tuple[int, int, int]]]]
-"""Each frame's identifier, its rig's, its pose [7], and (kind of sensor, sensor, image) of what was taken."""
-
-
-def _binary_rigs(path: Path) -> Rigs:
-    file = _Binary(path)
-    for _ in file.records(8):
-        rig, count = file.unpack("II")
-        sensors = []
-        for position in range(count):
-            sensor = file.unpack("iI")
-            if position and file.unpack("B")[0]:
-                sensors.append((sensor, np.array(file.unpack("7d"))))
-        yield rig, sensors
-
-
-def _binary_frames(path: Path) -> Frames:
-    file = _Binary(path)
-    for _ in file.records(68):
-        frame, rig, *pose, count = file.unpack("II7dI")
-        yield frame, rig, np.array(pose), [file.unpack("iIQ") for _ in range(count)]
-
-
-def _text_rigs(path: Path) -> Rigs:
-    for line, words in _text_records(path):
-        sensors, rest, count = [], words[4:], 1
-        try:
-            _ = SENSORS.index(words[2]), int(words[3])  # the reference sensor, which is in the middle of the rig
-            while rest:
-                if int(rest[2]):
-                    sensors.append(((SENSORS.index(rest[0]), int(rest[1])), np.array(rest[3:10], np.float64)))
-                    if sensors[-1][1].shape != (7,):
-                        raise ValueError
-                rest, count = rest[10 if int(rest[2]) else 3 :], count + 1
-            if count != int(words[1]):
-                raise ValueError
-            yield int(words[0]), sensors
-        except (ValueError, IndexError):
-            raise _line_damaged(path, line, "a rig: identifier, count of sensors, and the sensors") from None
-
-
-def _text_frames(path: Path) -> Frames:
-    for line, words in _text_records(path):
-        try:
-            members = [
-                (SENSORS.index(words[at]), int(words[at + 1]), int(words[at + 2])) for at in range(10, len(words), 3)
-            ]
-            pose = np.array(words[2:9], np.float64)
-            if pose.shape != (7,):
-                raise ValueError
-            yield int(words[0]), int(words[1]), pose, members
-        except (ValueError, IndexError):
-            raise _line_damaged(path, line, "a frame: identifier, rig, rotation, translation and images") from None
-
-
 def _damaged(path: Path, trouble: str) -> InputError:
     return InputError(f"{path} is damaged: {trouble}; copy or reconstruct it again")
 
 
-def _camera(path: Path, number: int, model: str, width: int, height: int, params: list[float]) -> pycolmap.Camera:
-    import pycolmap
+class _Words:
+    """The words of a text file's line, read one after the other as `_Binary` reads bytes."""
 
-    if not (0 < width < 2**31 and 0 < height < 2**31):
-        raise _damaged(path, f"camera {number} is {width}x{height} pixels")
-    try:
-        camera = pycolmap.Camera(camera_id=number, model=model, width=width, height=height, params=params)
-    except Exception as error:  # pycolmap raises whatever C++ threw
-        raise _damaged(path, f"camera {number} has the unknown model {model}") from error
-    if not camera.verify_params():
-        raise _damaged(path, f"camera {number} is {model} with {len(params)} parameters")
-    return camera
+    def __init__(self, path: Path, line: int, words: list[str]) -> None:
+        self.path, self.line, self.words = path, line, iter(words)
+
+    def take(self, layout: str) -> tuple:
+        """The next numbers, by a layout of the struct module. Names of sensors and camera models count as numbers."""
+        codes = (code for count, code in re.findall(r"(\d*)(\D)", layout) for code in code * int(count or 1))
+        try:
+            return tuple([_number(next(self.words), code) for code in codes])
+        except (ValueError, KeyError, StopIteration):
+            raise _damaged(self.path, f"line {self.line} lacks a number, or has another word in its place") from None
+
+
+def _number(word: str, code: str) -> float:
+    """Raises `ValueError` or `KeyError` where the word is none."""
+    if code == "i" and word.isidentifier():
+        import pycolmap
+
+        return SENSORS[word] if word in SENSORS else int(pycolmap.CameraModelId.__members__[word])
+    return float(word) if code == "d" else int(word)
 
 
 class _Binary:
@@ -239,13 +200,14 @@ class _Binary:
         self.position += size
         return start
 
-    def unpack(self, format: str) -> tuple:
-        layout = struct.Struct("<" + format)
-        return layout.unpack_from(self.data, self.skip(layout.size))
+    def take(self, layout: str) -> tuple:
+        """The next numbers, by a layout of the struct module."""
+        numbers = struct.Struct("<" + layout)
+        return numbers.unpack_from(self.data, self.skip(numbers.size))
 
     def count(self, smallest: int) -> int:
         """A uint64 count of records that take at least `smallest` bytes each."""
-        (count,) = self.unpack("Q")
+        (count,) = self.take("Q")
         if count > (len(self.data) - self.position) // smallest:
             raise _damaged(self.path, f"it announces {count} records, more than its {len(self.data)} bytes can hold")
         return count
@@ -265,25 +227,40 @@ class _Binary:
         return self.data[start:end].decode(errors="surrogateescape")
 
 
-def _binary_cameras(path: Path) -> dict[int, pycolmap.Camera]:
+def _records(path: Path, smallest: int) -> Iterator[_Words | _Binary]:
+    """What each record of a file is read from: a line of a text file, or a binary file.
+
+    Args:
+        smallest: bytes of the smallest binary record.
+    """
+    if path.suffix == ".txt":
+        yield from (_Words(path, line, words) for line, words in _text_records(path))
+    else:
+        file = _Binary(path)
+        yield from (file for _ in file.records(smallest))
+
+
+def _read_cameras(path: Path) -> dict[int, pycolmap.Camera]:
     import pycolmap
 
     models = {int(model): name for name, model in pycolmap.CameraModelId.__members__.items() if int(model) >= 0}
-    file, cameras = _Binary(path), {}
-    for _ in file.records(SMALLEST_CAMERA):
-        number, model, width, height = file.unpack("IiQQ")
+    cameras = {}
+    for record in _records(path, SMALLEST_CAMERA):
+        number, model, width, height = record.take("IiQQ")
         if model not in models:
             raise _damaged(path, f"camera {number} has the unknown model {model}")
-        known = pycolmap.Camera.create_from_model_name(1, models[model], 1.0, 1, 1)
-        params = list(file.unpack(f"{len(known.params)}d"))
-        cameras[number] = _camera(path, number, models[model], width, height, params)
+        if not (0 < width < 2**31 and 0 < height < 2**31):
+            raise _damaged(path, f"camera {number} is {width}x{height} pixels")
+        camera = pycolmap.Camera.create_from_model_name(number, models[model], 1.0, width, height)
+        camera.params = list(record.take(f"{len(camera.params)}d"))
+        cameras[number] = camera
     return cameras
 
 
 def _binary_images(path: Path) -> Iterator[ModelImage]:
     file = _Binary(path)
     for _ in file.records(SMALLEST_IMAGE):
-        number, *pose, camera = file.unpack("I7dI")
+        number, *pose, camera = file.take("I7dI")
         name = file.name()
         count = file.count(FEATURE.itemsize)
         features = np.frombuffer(file.data, FEATURE, count, file.skip(count * FEATURE.itemsize))
@@ -329,18 +306,6 @@ def _text_records(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _line_damaged(path: Path, number: int, what: str) -> InputError:
     return _damaged(path, f"line {number} is not {what}")
-
-
-def _text_cameras(path: Path) -> dict[int, pycolmap.Camera]:
-    cameras = {}
-    for line, words in _text_records(path):
-        try:
-            number, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
-            params = [float(word) for word in words[4:]]
-        except (ValueError, IndexError):
-            raise _line_damaged(path, line, "a camera: identifier, model, width, height and parameters") from None
-        cameras[number] = _camera(path, number, model, width, height, params)
-    return cameras
 
 
 def _text_images(path: Path) -> Iterator[ModelImage]:

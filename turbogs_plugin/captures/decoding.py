@@ -44,7 +44,7 @@ SMALL_WORK = 2**30
 """Bytes that are not worth a question."""
 
 
-def reduced_sizes(sizes: np.ndarray, factor: int) -> np.ndarray:
+def reduced_sizes(sizes: np.ndarray, factor: float) -> np.ndarray:
     """[V, 2] int64: sizes divided by `factor`, to the nearest pixel.
 
     Raises:
@@ -55,7 +55,7 @@ def reduced_sizes(sizes: np.ndarray, factor: int) -> np.ndarray:
         width, height = sizes[sizes.min(axis=1).argmin()].tolist()
         largest = max(1, int(min(width, height) / (SMALLEST_SIDE - 0.5)))
         raise InputError(
-            f"--factor {factor} leaves too little of photos of {width}x{height}: the largest that keeps "
+            f"--factor {factor:g} leaves too little of photos of {width}x{height}: the largest that keeps "
             f"{SMALLEST_SIDE} pixels a side is {largest}"
         )
     return reduced
@@ -76,12 +76,6 @@ def require_8_bits(image: Image.Image, path: Path) -> None:
 def is_transparent(image: Image.Image) -> bool:
     """Whether an image may have pixels that are not opaque, by its header."""
     return "A" in image.getbands() or "transparency" in image.info
-
-
-def is_turned(path: Path) -> bool:
-    """Whether the EXIF orientation of a photo says that width and height are to be exchanged."""
-    with opened_image(path) as image:
-        return image.getexif().get(ExifTags.Base.Orientation) in (5, 6, 7, 8)
 
 
 def channels_of(paths: Sequence[Path]) -> int:

@@ -6,8 +6,7 @@ points that are seen in at least two photos, displaced by a little noise, with t
 
 from __future__ import annotations
 
-import os
-import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -190,27 +189,36 @@ def write_demo_capture(path: str | Path, seed: int = 0, views: int = 32, width: 
         raise InputError(f"{target} is there already: choose a new folder for the demo capture")
     if views < 3 or width < 1 or height < 1:
         raise InputError(f"the demo capture was asked for {views} views of {width}x{height}: at least 3 of 1x1 needed")
-    partial = target.with_name(f"{target.name}.partial-{os.getpid()}")
-    try:
-        _write(partial, np.random.default_rng(seed), views, width, height)
-        os.replace(partial, target)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    reconstruction = load_pycolmap().Reconstruction()  # where the package is absent, or another one, that is said first
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".") as temporary:
+        capture = Path(temporary) / "capture"
+        model = capture / "sparse" / "0"
+        (capture / "images").mkdir(parents=True)
+        model.mkdir(parents=True)
+        random = np.random.default_rng(seed)
+        poses = np.stack([orbit_pose(2 * np.pi * view / views) for view in range(views)])  # [V, 3, 4]
+        seen = _photograph(capture / "images", random, poses, width, height)
+        _fill(reconstruction, poses, *seen, FOCAL * width, random)
+        write_whole(reconstruction, model, target)
+        capture.rename(target)
     return target
 
 
-def _write(folder: Path, random: np.random.Generator, views: int, width: int, height: int) -> None:
-    solids = demo_solids(random)
-    reconstruction = load_pycolmap().Reconstruction()  # another package of that name has none: said before photos
-    (folder / "images").mkdir(parents=True)
-    (folder / "sparse" / "0").mkdir(parents=True)
-    focal = FOCAL * width
-    poses = np.stack([orbit_pose(2 * np.pi * view / views) for view in range(views)])  # [V, 3, 4]
-    side = RAYS_PER_SIDE
-    x, y = np.meshgrid((np.arange(width * side) + 0.5) / side, (np.arange(height * side) + 0.5) / side)
-    rays = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)], axis=-1)
+def _photograph(
+    folder: Path, random: np.random.Generator, poses: np.ndarray, width: int, height: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Write the photos of cameras [V, 3, 4].
 
-    depths = np.empty((views, height, width), dtype=np.float32)
+    Returns:
+        [M, 3] points on surfaces; [M, 3] their colours, 0 .. 1; [V, H, W] depths of the pixels' centres, infinite where
+        there is nothing.
+    """
+    solids, side = demo_solids(random), RAYS_PER_SIDE
+    x, y = np.meshgrid((np.arange(width * side) + 0.5) / side, (np.arange(height * side) + 0.5) / side)
+    focal = FOCAL * width
+    rays = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)], axis=-1)
+    depths = np.empty((len(poses), height, width), dtype=np.float32)
     points, point_colors = [], []
     for view, pose in enumerate(poses):
         origin = (-pose[:, :3].T @ pose[:, 3]).astype(np.float32)
@@ -219,21 +227,14 @@ def _write(folder: Path, random: np.random.Generator, views: int, width: int, he
         directions /= lengths
         colors, distances = cast(solids, origin, directions)
         pixels = colors.reshape(height, side, width, side, 3).mean(axis=(1, 3))
-        Image.fromarray(np.round(pixels * 255).astype(np.uint8)).save(folder / "images" / PHOTO_NAME.format(view))
+        Image.fromarray(np.round(pixels * 255).astype(np.uint8)).save(folder / PHOTO_NAME.format(view))
         centers = np.s_[side // 2 :: side, side // 2 :: side]
         depths[view] = (distances[:, None] / lengths).reshape(height * side, width * side)[centers]
         hits = np.flatnonzero(np.isfinite(distances))
         chosen = random.choice(hits, min(POINTS_PER_VIEW, len(hits)), replace=False)
         points.append(origin + distances[chosen, None] * directions[chosen])
         point_colors.append(colors[chosen])
-    _fill(reconstruction, poses, np.concatenate(points), np.concatenate(point_colors), depths, focal, random)
-    model = folder / "sparse" / "0"
-    try:
-        write_whole(reconstruction, model, model)
-    except OSError as error:
-        raise InputError(
-            f"the demo capture cannot be written to '{folder.parent}': make room there, or choose another place"
-        ) from error
+    return np.concatenate(points), np.concatenate(point_colors), depths
 
 
 def _fill(
@@ -249,8 +250,7 @@ def _fill(
 
     Args:
         poses: [V, 3, 4] world to camera.
-        points, colors: [M, 3] on surfaces; colours 0 .. 1.
-        depths: [V, H, W] of the pixels' centres, inf where there is nothing.
+        points, colors, depths: as `_photograph` returns them.
         focal: pixels.
     """
     views, height, width = depths.shape
@@ -263,9 +263,8 @@ def _fill(
     visible &= visible.sum(axis=0) >= 2
 
     pycolmap = load_pycolmap()
-    camera = pycolmap.Camera(
-        camera_id=1, model="PINHOLE", width=width, height=height, params=[focal, focal, width / 2, height / 2]
-    )
+    params = [focal, focal, width / 2, height / 2]
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=width, height=height, params=params)
     reconstruction.add_camera_with_trivial_rig(camera)
     positions = np.cumsum(visible, axis=1) - 1  # [V, M] number of a point among those of its view
     for view in range(views):
@@ -274,8 +273,7 @@ def _fill(
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(poses[view]))
     displaced = points + random.normal(scale=POINT_NOISE, size=points.shape)
     for point in np.flatnonzero(visible.any(axis=0)):
-        track = pycolmap.Track(
-            [pycolmap.TrackElement(view + 1, positions[view, point]) for view in np.flatnonzero(visible[:, point])]
-        )
+        seen_by = np.flatnonzero(visible[:, point])
+        track = pycolmap.Track([pycolmap.TrackElement(view + 1, positions[view, point]) for view in seen_by])
         reconstruction.add_point3D(displaced[point], track, np.round(colors[point] * 255).astype(np.uint8))
     reconstruction.update_point_3d_errors()

@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 
-NO_MASKS = torch.zeros(0, dtype=torch.int64)
-"""Counts of unmasked pixels where a capture has no masks."""
 ROUNDING = 1e-5
 """Two readings of one reconstruction differ by less: in extents, and relative to each intrinsic."""
 
@@ -25,11 +24,7 @@ def capture_state(scene: Scene) -> dict[str, Any]:
 
 
 def frame_of_state(state: dict[str, Any]) -> Frame:
-    """The frame that `capture_state` wrote down.
-
-    Raises:
-        InputError: it is none.
-    """
+    """The frame in a `capture_state`. Raises `InputError` where it is none."""
     return Frame(np.array(state["frame"]["center"]), state["frame"]["scale"])
 
 
@@ -43,35 +38,23 @@ def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
         before, now = saved[f"{split}_views"], present[f"{split}_views"]
         if before["names"] != now["names"]:
             return f"other {split} images"
-        for same, what in (
-            (torch.equal(before["sizes"], now["sizes"]), "sizes"),
-            (torch.equal(before["unmasked"], now["unmasked"]), "masks"),
-            (
-                _close(before["Ks"], now["Ks"], ROUNDING * now["Ks"].abs())
-                and _close(before["viewmats"], now["viewmats"], torch.tensor(ROUNDING)),
-                "cameras",
-            ),
-        ):
-            if not same:
+        bounds = {"sizes": 0.0, "unmasked": 0.0, "Ks": ROUNDING * now["Ks"].abs(), "viewmats": ROUNDING}
+        for key, bound in bounds.items():
+            if before[key].shape != now[key].shape or not ((before[key] - now[key]).abs() <= bound).all():
+                what = {"unmasked": "masks", "sizes": "sizes"}.get(key, "cameras")
                 return f"other {what} of {split} images"
-    before, now = frame_of_state(saved), frame_of_state(present)
-    moved = np.abs(before.center - now.center).max()
-    if max(moved, abs(before.scale - now.scale)) > ROUNDING * now.scale:
-        return "other coordinates"
-    return ""
+    first, frame = frame_of_state(saved), frame_of_state(present)
+    moved = max(np.abs(first.center - frame.center).max(), abs(first.scale - frame.scale))
+    return "other coordinates" if moved > ROUNDING * frame.scale else ""
 
 
 def _views_state(views: PosedImages) -> dict[str, Any]:
     cameras = views.cameras
-    unmasked = NO_MASKS if views.masks is None else torch.from_numpy(views.masks.pixel_counts)
+    counts: Tensor = torch.zeros(0, dtype=torch.int64)  # without masks
     return {
-        "unmasked": unmasked,  # [V] int64
+        "unmasked": counts if views.masks is None else torch.from_numpy(views.masks.pixel_counts),  # [V] int64
         "names": list(views.names),
         "sizes": torch.from_numpy(cameras.sizes),  # [V, 2] int64
         "viewmats": cameras.viewmats,  # [V, 4, 4] float32
         "Ks": cameras.Ks,  # [V, 3, 3] float32
     }
-
-
-def _close(before: torch.Tensor, now: torch.Tensor, tolerance: torch.Tensor) -> bool:
-    return before.shape == now.shape and bool(((before - now).abs() <= tolerance).all())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -14,17 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, named
-from turbogs_plugin.captures.decoding import (
-    channels_of,
-    is_turned,
-    load_photos,
-    photo_array,
-    photo_sizes,
-    reduced_sizes,
-)
-from turbogs_plugin.captures.kinds import capture_around, read_capture
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture
+from turbogs_plugin.captures.decoding import channels_of, load_photos, photo_array, photo_sizes, reduced_sizes
+from turbogs_plugin.captures.kinds import read_capture
 from turbogs_plugin.captures.mask_files import find_masks, load_masks
+from turbogs_plugin.captures.photo_files import IMAGES
 from turbogs_plugin.captures.starting_points import colors_in_photos
 from turbogs_plugin.captures.undistort import undistortion_note
 from turbogs_plugin.errors import InputError
@@ -64,7 +59,6 @@ def load_scene(
     factor: int = 1,
     test_every: int = 8,
     progress: Callable[[int, int], object] | None = None,
-    sized: Callable[[np.ndarray, np.ndarray], object] | None = None,
     meanwhile: Callable[[PosedViews, PosedViews, Tensor], object] | None = None,
 ) -> Scene:
     """Load a capture with its photos.
@@ -82,8 +76,6 @@ def load_scene(
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
             Captures with a split of their own (NeRF-synthetic, lists in a ``transforms.json``) keep it.
         progress: called with the number of photos decoded so far, and of all, by one thread at a time.
-        sized: called with the sizes [V, 2] (width, height) of training and of test views, before a photo is decoded;
-            what it raises ends the loading.
         meanwhile: called once, while photos are decoded, with training views, test views and the scene's points.
 
     Raises:
@@ -94,7 +86,7 @@ def load_scene(
         if not isinstance(number, int) or number < 1:
             raise InputError(f"{name} is {number}: it must be an integer of at least 1")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
-        capture = read_capture(scene, factor)
+        capture = read_capture(scene)
     test = _test_views(scene, capture, test_every)
     frame, viewmats, points = _normalised(scene, capture, test)
     files = _find_photos(scene, capture, factor)
@@ -109,10 +101,7 @@ def load_scene(
             )
     parts = [np.flatnonzero(part & seen) for part in (~test, test)]
     posed = [_posed(capture, viewmats, files.sizes, views) for views in parts]
-    # Before minutes go into photos that have no room.
-    if sized is not None:
-        sized(*(files.sizes[views] for views in parts))
-    colors = [_room(capture, files, views) for views in parts]
+    colors = [_room(capture, files, views) for views in parts]  # before minutes go into photos that have none
     counter, one_at_a_time = itertools.count(1), Lock()
 
     def loaded() -> None:
@@ -133,7 +122,7 @@ def load_scene(
         files.note,
         undistortion_note(capture.lenses),
         mask_note,
-        _masked_note(capture.names, masks, mask_files, files.sizes, seen),
+        _masked_note(capture.names, masks, files.sizes, seen),
         "transparent photos are composited on a background (train.background)" if train.photos.transparent else "",
         file_note([train.photos.stored, tested.photos.stored], "photos"),
     )
@@ -205,50 +194,39 @@ def _load_views(
 ) -> PosedImages:
     """Some views with their photos, decoded into `colors`; the last two arguments are for `load_photos`."""
     paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
-    photos = load_photos(paths, files.file_sizes[views], files.sizes[views], lenses, colors, loaded, meanwhile)
-    masked = _pixel_masks([masks[view] for view in views], files.sizes[views])
-    names = tuple(capture.names[view] for view in views)
-    return PosedImages(posed.cameras, names, photos, masked, posed.observations)
+    sizes, own, masked = files.sizes[views], [masks[view] for view in views], None
+    photos = load_photos(paths, files.file_sizes[views], sizes, lenses, colors, loaded, meanwhile)
+    if any(mask is not None for mask in own):
+        pairs = zip(own, sizes.tolist(), strict=True)
+        masked = PixelMasks.of_views([ViewMask.whole(tuple(size)) if mask is None else mask for mask, size in pairs])
+    return PosedImages(posed.cameras, tuple(capture.names[v] for v in views), photos, masked, posed.observations)
 
 
-def _pixel_masks(masks: list[ViewMask | None], sizes: np.ndarray) -> PixelMasks | None:
-    """The masks of views of these `sizes` [V, 2]; None where none has a masked pixel."""
-    if all(mask is None for mask in masks):
-        return None
-    pairs = zip(masks, sizes.tolist(), strict=True)
-    return PixelMasks.of_views([ViewMask.whole(tuple(size)) if mask is None else mask for mask, size in pairs])
-
-
-def _masked_note(
-    names: tuple[str, ...],
-    masks: list[ViewMask | None],
-    files: list[Path | None],
-    sizes: np.ndarray,
-    seen: np.ndarray,
-) -> str:
-    """How much is masked, by the photos' alpha where no file does it, and which views are left out for it, in one line;
-    empty where nothing is masked."""
+def _masked_note(names: tuple[str, ...], masks: list[ViewMask | None], sizes: np.ndarray, seen: np.ndarray) -> str:
+    """How much is masked, and which views are left out for it, in one line; empty where nothing is masked."""
     pixels = {view: mask.pixels for view, mask in enumerate(masks) if mask is not None}
-    if not (cut := list(pixels)):
+    if not pixels:
         return ""
-    share = 1.0 - sum(pixels.values()) / int(sizes[cut].prod(axis=1).sum())
+    share = 1.0 - sum(pixels.values()) / int(sizes[list(pixels)].prod(axis=1).sum())
     gone = [name for name, kept in zip(names, seen, strict=True) if not kept]
     left_out = f"; {len(gone)} masked whole are left out: {gone[0]}, ..." if gone else ""
-    by_alpha = sum(files[view] is None for view in cut)
-    by = "" if not by_alpha else " by their alpha" if by_alpha == len(cut) else f" ({by_alpha} by their alpha alone)"
-    return f"{len(cut)} photos have masked pixels{by}, {share:.1%} of them{left_out}"
+    return f"{len(pixels)} photos have masked pixels, {share:.1%} of them{left_out}"
 
 
 def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
     """The files to read where photos are to be reduced by `factor`: copies in ``images_<factor>`` where all are there
-    in the right size, else the full-size photos."""
-    if factor > 1 and factor % capture.reduction:
-        raise InputError(
-            f"--factor {factor}: the largest photos of {scene} are those of {capture.photo_folder.name}: use --factor "
-            f"{capture.reduction} or a multiple of it, or bring the full-size photos back"
-        )
-    remaining = max(1, factor // capture.reduction)
-    files = _reduced_copies(scene, capture, remaining) or _full_photos(scene, capture, remaining)
+    in the right size, else the capture's photos. Photos of ``images_4`` that are smaller than their cameras by that are
+    reduced already."""
+    files = _reduced_copies(scene, capture, factor)
+    if files is None:
+        paths = [capture.photo_folder / name for name in capture.names]
+        sizes = photo_sizes(paths)
+        note = _require_scaled(paths, sizes, capture.photo_sizes)
+        reduction = re.fullmatch(rf"{IMAGES}_(\d+)", capture.photo_folder.name)
+        smaller = capture.photo_sizes[0, 0] > 1.5 * sizes[0, 0]
+        already = int(reduction[1]) if reduction and smaller else 1
+        targets = reduced_sizes(_undistorted_sizes(capture, sizes), max(1.0, factor / already))
+        files = PhotoFiles(paths, sizes, targets, note)
     largest = files.sizes[np.argmax(files.sizes.prod(axis=1))]
     if largest.prod() > MOST_PIXELS:
         raise InputError(
@@ -259,39 +237,15 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
 
 
 def _reduced_copies(scene: Path, capture: Capture, factor: int) -> PhotoFiles | None:
-    if factor == 1:
-        return None
-    reduced_sizes(capture.sizes, factor)  # refuses a factor that is too large
+    """The copies in the folder beside the photos; None where one is missing or of another size."""
     folder = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
     paths = [folder / name for name in capture.names]
-    if capture.photo_folder == scene or not all(path.is_file() for path in paths):
+    if factor == 1 or capture.photo_folder == scene or not all(path.is_file() for path in paths):
         return None
     sizes = photo_sizes(paths)
     if (np.abs(sizes - capture.photo_sizes / factor) > 1.0).any():
         return None
     return PhotoFiles(paths, sizes, _undistorted_sizes(capture, sizes))
-
-
-def _full_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
-    paths = [capture.photo_folder / name for name in capture.names]
-    missing = [name for name, path in zip(capture.names, paths, strict=True) if not path.is_file()]
-    if len(missing) == len(paths) and (where := capture_around(scene)):
-        raise InputError(where)
-    if missing:
-        remedy = _in_other_letters(capture.photo_folder / missing[0]) or "bring them back"
-        raise InputError(
-            f"{len(missing)} of {len(paths)} photos are missing in {capture.photo_folder}: {named(missing)}; {remedy}"
-        )
-    sizes = photo_sizes(paths)
-    note = _require_scaled(paths, sizes, capture.photo_sizes)
-    return PhotoFiles(paths, sizes, reduced_sizes(_undistorted_sizes(capture, sizes), factor), note)
-
-
-def _in_other_letters(path: Path) -> str:
-    """What to do where a file that is missing is there in capital or small letters; empty where it is not."""
-    beside = path.parent.iterdir() if path.parent.is_dir() else ()
-    other = next((file.name for file in beside if file.name.lower() == path.name.lower()), None)
-    return f"{other} is there: give the files the letters that the reconstruction has" if other else ""
 
 
 def _undistorted_sizes(capture: Capture, sizes: np.ndarray) -> np.ndarray:
@@ -306,25 +260,14 @@ def _require_scaled(paths: list[Path], sizes: np.ndarray, expected: np.ndarray) 
     Raises:
         InputError: a photo that is no scaled copy, to a pixel, of one of its camera's size: it was cropped or turned.
     """
-    ratios = sizes / expected  # [V, 2]
-    scaled = (np.abs(expected * ratios[:, ::-1] - sizes) <= 1.0).any(axis=1)
-    if not scaled.all():
-        bad = int(np.argmin(scaled))
-        (width, height), (camera_width, camera_height) = sizes[bad].tolist(), expected[bad].tolist()
-        differ = f"photo {paths[bad]} is {width}x{height} but its camera is {camera_width}x{camera_height}"
-        if is_turned(paths[bad]):
-            raise InputError(
-                f"{differ}: its EXIF orientation turns it, which is not followed here; write its pixels turned, as by  "
-                "magick mogrify -auto-orient PHOTO"
-            )
-        raise InputError(
-            f"{differ}: it was cropped or turned, not scaled; use the photos that the cameras were reconstructed from"
-        )
-    others = np.flatnonzero((sizes != expected).any(axis=1))
+    scaled = (np.abs(expected * (sizes / expected)[:, ::-1] - sizes) <= 1.0).any(axis=1)
+    others = np.flatnonzero(~scaled if not scaled.all() else (sizes != expected).any(axis=1))
     if not len(others):
         return ""
-    (width, height), (camera_width, camera_height) = sizes[others[0]].tolist(), expected[others[0]].tolist()
-    return (
-        f"{len(others)} photos in another size than their cameras: intrinsics rescaled from "
-        f"{camera_width}x{camera_height} to {width}x{height}"
-    )
+    size, camera = ("x".join(map(str, both[others[0]].tolist())) for both in (sizes, expected))
+    if not scaled.all():
+        raise InputError(
+            f"photo {paths[others[0]]} is {size} but its camera is {camera}: it was cropped or turned (an EXIF "
+            "orientation is not followed), not scaled; use the photos that the cameras were reconstructed from"
+        )
+    return f"{len(others)} photos in another size than their cameras: intrinsics rescaled from {camera} to {size}"

@@ -36,9 +36,8 @@ HALF = 128
 def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[list[Path | None], str]:
     """The file of each photo's mask, None where there is none, and what to tell the user of it.
 
-    Those that the capture names come first. Others are ``masks/NAME.png`` or COLMAP's ``masks/NAME.EXTENSION.png``,
-    else of the photo's own name or ``masks/NAME.jpg``, in the capture or beside the folder of its photos. For photos
-    of ``images_4``, masks of ``masks_4`` come first.
+    Masks that the capture names come first. Others are found by `in_folders`, in the capture or beside the folder of
+    its photos. For photos of ``images_4``, masks of ``masks_4`` come first.
 
     Args:
         photos: the V files.
@@ -48,28 +47,20 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
     parents = dict.fromkeys((scene, capture.photo_folder.parent, capture.photo_folder))
     folders = [parent / name for name in names for parent in parents if (parent / name).is_dir()]
     found = [file or in_folders(folders, name) for file, name in zip(capture.mask_files, capture.names, strict=True)]
-    count, views = sum(file is not None for file in found), len(found)
-    if count == 0:
+    if not (files := [file for file in found if file is not None]):
         unused = (f"{folder} is not used: it has no {CONVENTIONS} of a photo" for folder in folders)
         return found, next(unused, "") or misnamed(parents)
-    first = next(file for file in found if file is not None)
-    without = [name for name, file in zip(capture.names, found, strict=True) if file is None]
-    rest = f"; {len(without)} photos without one are whole: {without[0]}, ..." if without else ""
-    return found, f"masks of {count} of {views} photos, as {first}{rest}"
+    whole = f"; {len(found) - len(files)} photos without one are whole" if len(files) < len(found) else ""
+    return found, f"masks of {len(files)} of {len(found)} photos, as {files[0]}{whole}"
 
 
 def misnamed(parents: Iterable[Path]) -> str:
     """A note on the first folder of images in these that is called like one of masks, and not `FOLDER`; empty where
     there is none."""
-    for parent in parents:
-        try:
-            folders = sorted(entry for entry in parent.iterdir() if re.fullmatch(MASKS, entry.name, re.IGNORECASE))
-        except OSError:  # may be looked into, but not listed
-            continue
-        for folder in folders:
-            place, images = find_photos(folder)
-            if folder.name != FOLDER and images and place == folder:  # not a capture of a mask
-                return f"{folder} is not used: masks are read from {FOLDER}/; rename it if it holds the photos' masks"
+    folders = [entry for parent in parents if parent.is_dir() for entry in sorted(parent.iterdir())]
+    for folder in folders:
+        if re.fullmatch(MASKS, folder.name, re.IGNORECASE) and folder.name != FOLDER and find_photos(folder)[1]:
+            return f"{folder} is not used: masks are read from {FOLDER}/; rename it if it holds the photos' masks"
     return ""
 
 
@@ -101,18 +92,15 @@ def load_masks(
     full_sizes = capture.photo_sizes
 
     def load(view: int) -> ViewMask | None:
-        size = tuple(sizes[view].tolist())
-        parts = []
+        size, target = tuple(sizes[view].tolist()), tuple(targets[view].tolist())
+        keep = np.ones(size[::-1], dtype=bool)
         if (file := files[view]) is not None:
-            parts.append(_read(file, photos[view], size, tuple(full_sizes[view].tolist())))
+            keep &= _read(file, photos[view], size, tuple(full_sizes[view].tolist()))
         if capture.alpha == "mask" and photos[view].suffix.lower() not in OPAQUE_SUFFIXES:
             with opened_image(photos[view]) as image:
                 if is_transparent(image):
-                    parts.append(np.asarray(image.convert("RGBA").getchannel("A")) > 0)
-        if all(part.all() for part in parts):
-            return None
-        keep = np.logical_and.reduce(parts)
-        return ViewMask.of(_placed(keep, capture.lenses[view], tuple(targets[view].tolist())))
+                    keep &= np.asarray(image.convert("RGBA").getchannel("A")) > 0
+        return None if keep.all() else ViewMask.of(_placed(keep, capture.lenses[view], target))
 
     with decoding_threads(DECODING_BYTES * int(full_sizes.prod(axis=1).max(initial=1))) as pool:
         return list(pool.map(load, range(len(photos))))
@@ -129,7 +117,7 @@ def _read(file: Path, photo: Path, size: tuple[int, int], full_size: tuple[int, 
         if values.ndim == 3 and image.mode in ("LA", "RGBA"):
             values = values[:, :, :-1] * (values[:, :, -1:] > 0)
         keep = (values.reshape(*values.shape[:2], -1) >= least).any(axis=2)
-    return _reduced(keep, size)
+    return _reduced(np.asarray(keep), size)
 
 
 def require_mask_size(
@@ -147,13 +135,11 @@ def _placed(keep: np.ndarray, lens: Lens | None, target: tuple[int, int]) -> np.
     """[H, W] bool: the mask after what is done to its photo."""
     if lens is not None:
         image = np.where(keep, np.uint8(255), np.uint8(0))[:, :, None]
-        undistorted = lens.undistort(image, lens.size_of((keep.shape[1], keep.shape[0])))
-        return _reduced(np.asarray(undistorted[:, :, 0] == 255), target)
+        keep = np.equal(lens.undistort(image, lens.size_of((keep.shape[1], keep.shape[0])))[:, :, 0], 255)
     return _reduced(keep, target)
 
 
 def _reduced(keep: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    if keep.shape == (size[1], size[0]):
-        return keep
+    """[H, W] bool of `size` (width, height): True where all that a pixel is made of is True."""
     image = Image.fromarray(np.where(keep, np.uint8(255), np.uint8(0)))
-    return np.asarray(image.resize(size, Image.Resampling.BOX)) == 255
+    return np.asarray(image if image.size == size else image.resize(size, Image.Resampling.BOX)) == 255

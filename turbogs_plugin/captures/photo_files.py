@@ -1,45 +1,39 @@
-"""Photo files: those of a folder without cameras, and where the ones lie that a capture names.
-
-`find_photo_folder` is the rule for COLMAP's names, `find_frame_photos` the one for frames of JSON files.
-"""
+"""Photo files: the photos of a folder without cameras, and the photos that a capture names."""
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
+import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from itertools import takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from turbogs_plugin.captures.capture import FEWEST_PHOTOS, check_photo_name, named
-from turbogs_plugin.captures.decoding import photo_size
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, require_printable
 from turbogs_plugin.errors import InputError
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
-"""Files that are photos: what both pillow and COLMAP read."""
+"""Suffixes of photos that both pillow and COLMAP read."""
 OTHER_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2")
-"""Photos that at least one of them does not read."""
+"""Suffixes of photos that at least one of them does not read."""
+NAMED_SUFFIXES = (*PHOTO_SUFFIXES, ".webp", ".avif", ".jp2")
+"""Suffixes of files that may stand for a photo that is not where a capture names it."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".insv")
 FRAMES_OF_VIDEO = "ffmpeg -i VIDEO -vf fps=2 -q:v 2 PHOTOS/%05d.jpg"
 MASKS = "masks?(_images)?"
 """Names of folders of masks, in any letters; one of them is read (`mask_files.FOLDER`)."""
 NO_PHOTOS = re.compile(rf"\..*|images_\d+|{MASKS}", re.IGNORECASE)
-"""Folders that hold none: hidden ones, copies reduced by a factor (``images_4``), masks."""
-PHOTO_DEPTH = 1
-"""Photos are looked for in a folder and in the folders in it. Those of several captures beside each other lie deeper,
-in the ``images`` of each."""
-ORIGINALS = "input"
-"""Where gaussian-splatting's ``convert.py`` keeps the photos that it undistorts into ``images``."""
-REDUCED = re.compile(r"_\d+$")
+"""Folders without photos: hidden ones, copies reduced by a factor (``images_4``), masks."""
 OTHER_IMAGES = re.compile(r"(depth|normal|semantic|segmentation|confidence)s?|.*[_-]masks?", re.IGNORECASE)
 """Folders of images that have the photos' names and are none."""
-FOLDER_DEPTH = 2
-"""Photos and models are looked for in folders of folders, no deeper."""
-REDUCTIONS = (2, 4, 8, 16)
-FRAME_SUFFIXES = (".png", ".jpg", ".jpeg")
-"""Suffixes of photos that files of frames name."""
+PHOTO_DEPTH = 1
+"""Photos are looked for in a folder and in the folders in it. The photos of several captures beside each other lie
+deeper, in the ``images`` of each."""
+FOLDER_DEPTH = 4
+"""Named photos are looked for in folders of a capture, no deeper than this."""
+IMAGES, REDUCED = "images", tuple(f"images_{factor}" for factor in (2, 4, 8, 16))
+"""Folder of the photos, and of copies reduced by a factor."""
 
 
 def find_photos(folder: Path) -> tuple[Path, list[Path]]:
@@ -48,7 +42,7 @@ def find_photos(folder: Path) -> tuple[Path, list[Path]]:
     Returns:
         The folder that their names are relative to; the photos in the order of their names.
     """
-    for place in (folder / "images", folder):
+    for place in (folder / IMAGES, folder):
         if photos := [path for path in _files(place, PHOTO_DEPTH) if path.suffix.lower() in PHOTO_SUFFIXES]:
             break
     return place, sorted(photos, key=lambda path: path.relative_to(place).as_posix())
@@ -77,152 +71,108 @@ def _files(folder: Path, depth: int) -> list[Path]:
     return files
 
 
-def find_photo_folder(scene: Path, sizes: Mapping[str, tuple[int, int]]) -> tuple[Path, int]:
-    """The folder that the names of the photos are relative to, and by which factor they are reduced there.
-
-    That is ``images`` in the scene, if `FEWEST_PHOTOS` are there: where some of them were taken away, whole folders may
-    hold depth maps or another capture's photos of the same names. Else looked at are ``images`` beside the scene, the
-    scene itself, the folders in all of these, and ``input`` beside it; then, as not all keep the full-size photos,
-    copies of them in ``images_2``, ``images_4``, ... Where none has all the photos it is the first of those that have
-    most; not one beside the scene, whose photos may be another one's of the same names.
-
-    Where the first photo that is there has not the size of its camera, and that of the same name in ``input`` has, it
-    is that folder: the others are undistorted copies.
-
-    Args:
-        sizes: (width, height) of each photo's camera, by the photo's name.
-    """
-    first, beside = scene / "images", scene.resolve().parent
-    there = [name for name in sizes if (first / name).is_file()]
-    if len(there) >= FEWEST_PHOTOS or not sizes:
-        return _of_cameras(first, scene / ORIGINALS, there, sizes), 1
-    places = (first, scene, beside / "images", beside / ORIGINALS)
-    whole = ((folder, 1) for place in places for folder in folders_in(place, FOLDER_DEPTH, of_photos=True))
-    reduced = ((scene / f"images_{factor}", factor) for factor in REDUCTIONS)
-    own: list[tuple[Path, int]] = []
-    for folder, reduction in itertools.chain(whole, reduced):
-        of_scene = scene in (folder, *folder.parents)
-        if all((folder / name).is_file() for name in sizes):
-            originals = (scene if of_scene else beside) / ORIGINALS
-            return (_of_cameras(folder, originals, list(sizes), sizes) if reduction == 1 else folder), reduction
-        if of_scene:  # beside the scene, photos of the same names may be another one's
-            own.append((folder, reduction))
-    return max(own, key=lambda place: sum((place[0] / name).is_file() for name in sizes))
-
-
-def _of_cameras(folder: Path, originals: Path, names: list[str], sizes: Mapping[str, tuple[int, int]]) -> Path:
-    """`originals`, if they have all the photos `names` too, the first of them in its camera's size, and `folder` has
-    that in another size; else `folder`."""
-    if not names or not all((originals / name).is_file() for name in names):
-        return folder
-    taken, size, original = _size_of(folder / names[0]), sizes[names[0]], _size_of(originals / names[0])
-    return originals if taken != size == original else folder
-
-
-def _size_of(photo: Path) -> tuple[int, int] | None:
-    try:
-        return photo_size(photo)
-    except InputError:  # raised again where all photos are read
-        return None
-
-
-def folders_in(place: Path, depth: int, of_photos: bool = False) -> Iterator[Path]:
-    """The folder and those in it, nearest first; `of_photos`: not `OTHER_IMAGES`, in which models may lie."""
-    level = [place]
-    for _ in range(depth + 1):
-        yield from level
-        try:
-            inner = [entry for folder in level if folder.is_dir() for entry in sorted(folder.iterdir())]
-        except OSError:
-            return
-        level = [entry for entry in inner if _is_looked_into(entry, of_photos)]
-
-
-def _is_looked_into(entry: Path, of_photos: bool) -> bool:
-    barred = (NO_PHOTOS, OTHER_IMAGES) if of_photos else (NO_PHOTOS,)
-    return not (REDUCED.search(entry.name) or any(each.fullmatch(entry.name) for each in barred)) and entry.is_dir()
-
-
-def file_named(scene: Path, name: str, source: Path, photo: bool = False) -> str | None:
-    """The path, relative to the scene, of the file that a capture names; None where it is not there.
+def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | None:
+    """The path, relative to the scene, of a file that a capture names; None where it is not there.
 
     Separators may be Windows' ones. Of a path of the machine that wrote it, absolute or with '..', the longest end
-    counts that is there.
+    counts that is there, so the file lies in the scene.
 
     Args:
-        photo: the suffix may lack, as in Blender's names, or be in other letters.
+        folder: of the scene, that names are relative to.
 
     Raises:
         InputError: a name that cannot be printed.
     """
+    require_printable(name, source)
     path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
-    if not name.isprintable():
-        check_photo_name(name, source)
     parts = path.parts[1:] if path.anchor else path.parts
     below = not path.anchor and ".." not in parts
-    ends = ["/".join(parts[first:]) for first in range(1 if below else len(parts)) if ".." not in parts[first:]]
-    forms = (form for end in ends for form in (_forms(end) if photo else [end]))
+    ends = [parts[first:] for first in range(1 if below else len(parts)) if parts and ".." not in parts[first:]]
+    forms = (PurePosixPath(folder, *end).as_posix() for end in ends)
     return next((form for form in forms if (scene / form).is_file()), None)
 
 
-def _forms(name: str) -> list[str]:
-    """The names that a photo may have that is called so: with a suffix, or its suffix in other letters."""
-    suffix = PurePosixPath(name).suffix
-    stem = name.removesuffix(suffix)
-    endings = [ending for each in FRAME_SUFFIXES for ending in (each, each.upper())]
-    return [name, *(f"{name}{ending}" for ending in endings), f"{stem}{suffix.lower()}", f"{stem}{suffix.upper()}"]
+def find_named(
+    scene: Path,
+    names: Sequence[str],
+    source: Path,
+    folders: Sequence[str],
+    others: Collection[str] = (),
+    anywhere: bool = True,
+) -> tuple[list[str | None], list[str]]:
+    """The photos that a capture names: the one rule for every kind of capture.
 
+    - A photo counts that is where its name says (`file_named`), in the first of `folders` that has it; where fewer than
+      `FEWEST_PHOTOS` are, in ``images_2``, ``images_4``, ...
+    - Another name stands for a file in the folder that it says, of any suffix and in any letters. Where photos have
+      neighbours of other suffixes (masks, depths), it stands for none.
+    - Where no name is found so, names stand for files in the scene and in folders of it, `FOLDER_DEPTH` deep; for none
+      where a file may be meant by two names, or a name by two files.
 
-def find_frame_photos(
-    scene: Path, names: Sequence[str], others: Collection[str], source: Path
-) -> tuple[list[str | None], str, str]:
-    """Find the photos that the frames of a file name.
-
-    A photo counts that is where the file says (`file_named`). Where some are, others may have another suffix in the
-    same folder, if photos that are there have no such neighbours: these would be masks or depths. Where none is, photos
-    are looked for by their file names in the scene and in folders of it, `FOLDER_DEPTH` deep; of several files of one
-    name that one counts whose path ends as the photo's does.
+    Of several files for a name, one of its suffix counts before others, then one whose path ends as the name does.
 
     Args:
+        folders: in the scene, that names are relative to; '' for the scene itself.
         others: names of files that are no photos.
+        anywhere: the last rule is followed.
 
     Returns:
-        The photos' paths relative to the scene, None for those that are not found, and for all where one name may stand
-        for several files or one file for several names; a note on what was found elsewhere; what to add to a line on
-        photos that are missing.
+        The photos' paths relative to the scene, None where there is no photo; a note or none on photos that are not
+        where their names say.
+
+    Raises:
+        InputError: a name that cannot be printed, or that is there twice.
     """
-    found = [file_named(scene, name, source, photo=True) for name in names]
-    if all(found):
-        return found, "", ""
-    index = _index(scene, {PurePosixPath(other) for other in others})
-    exact, note = any(found), ""
-    if exact and any(len(_with_stem(index, PureWindowsPath(photo), beside=True)) > 1 for photo in found if photo):
-        return found, "", ""
-    moved: dict[str, str] = {}
-    for name, photo in zip(names, found, strict=True):
-        if photo is None:
-            best = _candidates(index, PureWindowsPath(name), beside=exact)
-            if len(best) > 1 and not exact:
-                return found, "", f" ({best[0].name} is in {named([str(scene / file.parent) for file in best])})"
-            if len(best) == 1:
-                moved[name] = str(best[0])
-    taken = Counter([*filter(None, found), *moved.values()])
-    twice = [file for file in moved.values() if taken[file] > 1]
-    if twice and not exact:
-        return found, "", f" ({scene / twice[0]} is of several names)"
-    moved = {name: file for name, file in moved.items() if taken[file] == 1}
-    if moved:
-        name, file = next(iter(moved.items()))
-        first = f"{file} is taken for {PureWindowsPath(name).as_posix()}"
-        note = f"{len(moved)} photos have another suffix than in {source.name}: {first}, ..."
-        if not all(_in_its_folder(PurePosixPath(file), PureWindowsPath(name)) for name, file in moved.items()):
-            folders = sorted({str(scene / PurePosixPath(file).parent) for file in moved.values()})
-            note = f"photos in {named(folders)}"
-    return [photo or moved.get(name) for name, photo in zip(names, found, strict=True)], note, ""
+    places = (folders, *((folder,) for folder in REDUCED))
+    tries = ([_first_there(scene, name, source, place) for name in names] for place in places)
+    first = next(tries)
+    found = first if _count(first) >= FEWEST_PHOTOS else next((each for each in tries if _count(each)), first)
+    plain = [path or PureWindowsPath(name).as_posix() for path, name in zip(found, names, strict=True)]
+    if twice := [path for path, times in Counter(plain).items() if times > 1]:
+        raise InputError(f"{source} names the photo {twice[0]} twice: take one out, or rename the photos")
+    moved: dict[int, str] = {}
+    if None in found:
+        index = _index(scene, {PurePosixPath(other) for other in others})
+        if not any(len(_like(index, PureWindowsPath(path), [""])) > 1 for path in filter(None, found)):
+            missing = {place: PureWindowsPath(names[place]) for place, path in enumerate(found) if path is None}
+            moved, _ = _moved(index, missing, folders)
+            if anywhere and not moved and not any(found):
+                moved, clear = _moved(index, missing, None)
+                moved = moved if clear else {}
+    paths = [moved.get(place, path) for place, path in enumerate(found)]
+    return paths, _moved_note(names, moved, source)
+
+
+def _first_there(scene: Path, name: str, source: Path, folders: Sequence[str]) -> str | None:
+    return next((path for folder in folders if (path := file_named(scene, name, source, folder))), None)
+
+
+def _count(found: Sequence[str | None]) -> int:
+    return sum(path is not None for path in found)
+
+
+def common_folder(scene: Path, paths: Sequence[str]) -> Path:
+    """The folder in the scene that all photos lie in, whose paths are relative to the scene; else the scene itself."""
+    first = {parts[0] if len(parts := PurePosixPath(path).parts) > 1 else "" for path in paths}
+    return scene / first.pop() if len(first) == 1 else scene
+
+
+def _moved_note(names: Sequence[str], moved: dict[int, str], source: Path) -> list[str]:
+    """A line on photos that are not where their names say, but for a suffix that names lack."""
+    pairs = [(path, PureWindowsPath(names[place]).as_posix()) for place, path in moved.items()]
+    pairs = [(path, name) for path, name in pairs if str(PurePosixPath(path).with_suffix("")) != name]
+    if not pairs:
+        return []
+    path, name = pairs[0]
+    return [f"{len(pairs)} photos are not where {source.name} says: {path} is taken for {name}, ..."]
 
 
 Index = dict[str, list[PurePosixPath]]
-"""Paths of files relative to a scene, by their stems in small letters."""
+"""Paths of files relative to a scene, by their stems in `_plain` letters."""
+
+
+def _plain(text: str) -> str:
+    return unicodedata.normalize("NFC", text).lower()
 
 
 def _index(scene: Path, others: Collection[PurePosixPath]) -> Index:
@@ -234,33 +184,47 @@ def _index(scene: Path, others: Collection[PurePosixPath]) -> Index:
         inner[:] = sorted(filter(str.isprintable, set(inner).difference(barred)))
         if len(place.parts) == FOLDER_DEPTH:
             inner.clear()
-        for file in sorted(inside):
-            if place / file not in others and PurePosixPath(file).suffix.lower() in FRAME_SUFFIXES:
-                files[PurePosixPath(file).stem.lower()].append(place / file)
+        for file in map(PurePosixPath, sorted(inside)):
+            if place / file not in others and file.suffix.lower() in NAMED_SUFFIXES:
+                files[_plain(file.stem)].append(place / file)
     return files
 
 
-def _with_stem(index: Index, name: PureWindowsPath, beside: bool) -> list[PurePosixPath]:
-    """Files of a photo's stem, whatever their suffix; `beside`: only those in its folder."""
+def _like(index: Index, name: PureWindowsPath, folders: Sequence[str] | None) -> list[PurePosixPath]:
+    """The files of a name's stem, in any letters and of any suffix.
+
+    Args:
+        folders: that names are relative to, in which alone files count; None: files of any folder count.
+    """
     # A number after a point is part of the name, and so is what is no suffix.
     stems = [name.name] if name.suffix[1:].isdigit() else [name.stem, name.name]
-    files = [file for stem in dict.fromkeys(stems) for file in index.get(stem.lower(), ())]
-    return [file for file in files if not beside or _in_its_folder(file, name)]
+    files = [file for stem in dict.fromkeys(stems) for file in index.get(_plain(stem), ())]
+    if folders is None:
+        return files
+    parts = name.parts[bool(name.anchor) : -1]
+    places = {PurePosixPath(folder, *parts) for folder in folders}
+    own = (file for file in files if file.parent in places or (name.anchor and _common_end(file, name) > 0))
+    return list(own)
 
 
-def _in_its_folder(file: PurePosixPath, name: PureWindowsPath) -> bool:
-    """Whether a file lies in the folder that a name says, or an absolute name ends with."""
-    parts, others = file.parts[:-1], name.parts[:-1]
-    return parts == others or (bool(name.anchor) and bool(parts) and parts == others[-len(parts) :])
+def _moved(
+    index: Index, names: dict[int, PureWindowsPath], folders: Sequence[str] | None
+) -> tuple[dict[int, str], bool]:
+    """The one file that each name stands for, and whether no name has several files, and no file several names."""
+    moved, clear = {}, True
+    for place, name in names.items():
+        files = _like(index, name, folders)
+        files = [file for file in files if _plain(file.name) == _plain(name.name)] or files
+        nearest = max((_common_end(file, name) for file in files), default=0)
+        files = [file for file in files if _common_end(file, name) == nearest]
+        clear &= len(files) < 2
+        if len(files) == 1:
+            moved[place] = str(files[0])
+    times = Counter(moved.values())
+    return {place: path for place, path in moved.items() if times[path] == 1}, clear and len(times) == len(moved)
 
 
-def _candidates(index: Index, name: PureWindowsPath, beside: bool) -> list[PurePosixPath]:
-    """The files that a name may stand for: of its suffix before others, and of the longest common end of paths."""
-    there = _with_stem(index, name, beside)
-    there = [file for file in there if file.name.lower() == name.name.lower()] or there
-    lengths = [_common_end(file.parts[:-1], name.parts[:-1]) for file in there]
-    return [file for file, length in zip(there, lengths, strict=True) if length == max(lengths)]
-
-
-def _common_end(parts: Sequence[str], others: Sequence[str]) -> int:
-    return len(list(takewhile(lambda both: both[0] == both[1], zip(reversed(parts), reversed(others), strict=False))))
+def _common_end(file: PurePosixPath, name: PureWindowsPath) -> int:
+    """How many folders at the end of both paths are equal."""
+    pairs = zip(reversed(file.parts[:-1]), reversed(name.parts[:-1]), strict=False)
+    return len(list(takewhile(lambda both: both[0] == both[1], pairs)))

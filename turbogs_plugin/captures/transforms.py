@@ -1,25 +1,31 @@
-"""``transforms.json`` of nerfstudio and instant-ngp."""
+"""Cameras in JSON: ``transforms.json`` of nerfstudio and instant-ngp, and NeRF-synthetic's ``transforms_train.json``.
+
+NeRF-synthetic tells training and test photos apart by file; its photos are named without a suffix and often
+transparent.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
 from turbogs_plugin.captures.camera_json import opengl_viewmat, read_camera, read_frames
-from turbogs_plugin.captures.capture import Capture, left_out, require_enough
-from turbogs_plugin.captures.photo_files import file_named, find_frame_photos
+from turbogs_plugin.captures.capture import Capture, absence_notes
+from turbogs_plugin.captures.photo_files import common_folder, file_named, find_named
 from turbogs_plugin.captures.starting_points import starting_points
 from turbogs_plugin.captures.undistort import Lens
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.ply import read_colors, read_vertices
 
-FILE = "transforms.json"
+FILE, TRAIN_FILE = "transforms.json", "transforms_train.json"
+TEST_FILES = ("transforms_test.json", "transforms_val.json")
+"""NeRF-synthetic's files of test photos: the first that is there, and has a photo, is used."""
 TRAIN, VALIDATION, TEST = LISTS = ("train_filenames", "val_filenames", "test_filenames")
-"""Lists of file names that are the capture's own split."""
+"""Lists of file names in a ``transforms.json`` that are the capture's own split."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +33,8 @@ class FrameView:
     """One frame whose photo is there.
 
     Args:
+        path: of the photo, relative to the scene.
+        written: the photo's name in the file, with ``/``.
         viewmat: [4, 4] float64, world to camera (x right, y down, z forward).
         K: [3, 3] float64, undistorted where there is a lens.
         size: (width, height), undistorted where there is a lens.
@@ -34,6 +42,8 @@ class FrameView:
         mask: the file of its mask; None: the frame names none.
     """
 
+    path: str
+    written: str
     viewmat: np.ndarray
     K: np.ndarray
     size: tuple[int, int]
@@ -41,226 +51,198 @@ class FrameView:
     mask: Path | None
 
 
-@dataclass
+@dataclass(frozen=True)
 class FrameViews:
-    """The frames of one file.
+    """The frames of a file.
 
     Args:
-        views: by their photos' paths relative to the scene, in the file's order.
+        content: the file's, with what stands for all frames.
+        views: in the file's order.
         absent: names of photos that do not exist.
-        written: photo's path, or the name of an absent one, by its name in the file.
         notes: on photos that are not where the file says.
-        unclear: why absent ones were not found elsewhere, for the line on them.
     """
 
-    views: dict[str, FrameView] = field(default_factory=dict)
+    content: dict[str, Any] = field(default_factory=dict)
+    views: list[FrameView] = field(default_factory=list)
     absent: list[str] = field(default_factory=list)
-    written: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    unclear: str = ""
 
 
-def read_frame_views(
-    scene: Path, source: Path, lenses: dict[tuple, Lens], remedy: str = "export it again"
-) -> tuple[dict[str, Any], FrameViews]:
-    """The content of a file of frames but for these, and the frames.
-
-    Intrinsics and distortion may stand in each frame or for all. A frame's ``mask_path`` is its mask. Frames whose
-    photo does not exist are left out.
+def read_frame_views(scene: Path, source: Path, lenses: dict[tuple, Lens], anywhere: bool = True) -> FrameViews:
+    """The frames of a file. Intrinsics and distortion may stand in each frame or for all.
 
     Args:
         lenses: lenses by their numbers; new ones are added.
-        remedy: for a pose that is none.
+        anywhere: photos may lie in other folders than the file says.
 
     Raises:
         InputError: a file that is not such JSON, lacks something or describes no lens; a photo that two frames name.
     """
     content, frames = read_frames(source)
-    written = [_file_path(frame, source) for frame in frames]
-    others = {text for frame in frames for key, text in frame.items() if isinstance(text, str) and key != "file_path"}
-    photos, note, unclear = find_frame_photos(scene, written, others, source)
-    found = FrameViews(notes=[note] if note else [], unclear=unclear)
-    for text, photo, frame in zip(written, photos, frames, strict=True):
-        name = PureWindowsPath(text).as_posix()
-        key = photo or name
-        if key in found.views or key in found.absent:
-            raise InputError(f"{source} has two frames for '{key}': take one of them out")
-        found.written[text] = key
-        if photo is None:
-            found.absent.append(name)
+    if not all(isinstance(frame.get("file_path"), str) for frame in frames):
+        raise InputError(f"{source} has a frame without a file_path: export it again")
+    texts = {text for frame in frames for key, text in frame.items() if isinstance(text, str) and key != "file_path"}
+    names = [frame["file_path"] for frame in frames]
+    paths, notes = find_named(scene, names, source, ("", "images"), texts, anywhere)
+    found = FrameViews(content, notes=notes)
+    for frame, path in zip(frames, paths, strict=True):
+        written = PureWindowsPath(frame["file_path"]).as_posix()
+        if path is None:
+            found.absent.append(written)
             continue
-        viewmat = opengl_viewmat(
-            frame.get("transform_matrix"),
-            absent=f"{source}: frame '{photo}' has no transform_matrix of 4x4 finite numbers: export it again",
-            wrong=f"{source}: the transform_matrix of frame '{photo}'",
-            remedy=f": {remedy}",
-        )
-        camera = read_camera({**content, **frame}, scene / photo, source, lenses)
-        found.views[photo] = FrameView(viewmat, *camera, _mask_file(scene, frame, photo, source))
-    return content, found
+        viewmat = opengl_viewmat(frame.get("transform_matrix"), f"{source}: the transform_matrix of frame '{path}'")
+        camera = read_camera({**content, **frame}, scene / path, source, lenses)
+        mask = None
+        if frame.get("mask_path") is not None:
+            mask = _file(scene, frame["mask_path"], f"mask_path of frame '{path}'", source)
+        found.views.append(FrameView(path, written, viewmat, *camera, mask))
+    return found
 
 
 def read_transforms(scene: Path) -> Capture:
-    """Read ``scene/transforms.json`` (`read_frame_views`).
+    """Read ``scene/transforms.json`` (`read_frame_views`), with the split of its lists.
 
-    Lists of file names are the capture's own split. Points come from ``ply_file_path``; where it is not given or has
-    none, they are drawn by `starting_points` about what the training cameras look at.
+    Points come from ``ply_file_path``; where it is not given or has none, they are drawn by `starting_points` about
+    what the training cameras look at.
 
     Raises:
         InputError: see `read_frame_views`; lists that are no split; a cloud that is absent or damaged.
     """
     source = scene / FILE
-    content, found = read_frame_views(scene, source, {})
-    test_names, unused, split = _own_split(content, found, scene, source)
-    views = {name: view for name, view in found.views.items() if name not in unused}
-    absent = [name for name in found.absent if name not in unused]
-    require_enough(scene, source, absent, len(views) + len(absent), found.unclear)
-    test = None
-    if test_names is not None:
-        test = np.array([name in test_names for name in sorted(views)])
-        if not test.any():
-            raise InputError(f"{source}: none of its {len(test_names)} test photos is in {scene}: bring them back")
+    found = read_frame_views(scene, source, {})
+    split = _own_split(found, source)
+    views, absent, words, test = found.views, found.absent, "", None
+    if split is not None:
+        train, test = split
+        views = [view for view in views if view.written in train | test]
+        absent = [name for name in absent if name in train | test]
+        tested = sum(view.written in test for view in views)
+        unused = len(found.views) + len(found.absent) - len(views) - len(absent)
+        left = f", {unused} others not used" if unused else ""
+        words = f", its own split, {len(views) - tested} training and {tested} test photos{left}"
+        if not tested:
+            raise InputError(f"{source}: none of its {len(test)} test photos is in {scene}: bring them back")
+    absence = absence_notes(scene, source, absent, len(views) + len(absent))
     points, colors, origin = np.empty((0, 3)), None, "no points"
-    if "ply_file_path" in content:
-        points, colors = _read_points(scene, content["ply_file_path"], source)
-        origin = f"{len(points):,} points of {content['ply_file_path']}"
-    # Reduced copies lie in images_2, images_4, ... beside images.
-    common = {PurePosixPath(name).parts[0] for name in views}
-    inside = len(common) == 1 and all(len(PurePosixPath(name).parts) > 1 for name in views)
-    capture = capture_of_views(scene, scene / common.pop() if inside else scene, views, test, points, colors)
-    if capture.point_colors is None:
-        origin = f"{origin}, so {len(capture.points):,} random ones {capture.notes[0]}"
-    notes = [f"{source} (nerfstudio, instant-ngp): {len(views)} photos{split}, {origin}", *found.notes]
-    if absent:
-        notes.append(left_out(absent, len(views) + len(absent), "frames"))
-    capture.notes = tuple(notes)
-    return capture.checked(source)
+    if "ply_file_path" in found.content:
+        points, colors = _read_points(_file(scene, found.content["ply_file_path"], "ply_file_path", source))
+        origin = f"{len(points):,} points of {found.content['ply_file_path']}"
+    kind = f"{source} (nerfstudio, instant-ngp): {len(views)} photos{words}, {origin}"
+    return _capture(scene, views, test, points, colors, kind, [*found.notes, *absence]).checked(source)
 
 
-def capture_of_views(
+def read_blender(scene: Path) -> Capture:
+    """Read a NeRF-synthetic capture (`read_frame_views`), with the split of its files.
+
+    Where there are no test photos, the split is left to the order of the photos. There are no points: random ones are
+    drawn (`starting_points`) about what the training cameras look at.
+
+    Raises:
+        InputError: see `read_frame_views`; one photo in both files.
+    """
+    source = scene / TRAIN_FILE
+    lenses: dict[tuple, Lens] = {}
+    train = read_frame_views(scene, source, lenses, anywhere=False)  # each folder has an r_0
+    absence_notes(scene, source, train.absent, len(train.views) + len(train.absent))
+    test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
+    test = FrameViews() if test_file is None else read_frame_views(scene, test_file, lenses, anywhere=False)
+    names = {view.written for view in test.views}
+    if both := sorted({view.path for view in train.views} & {view.path for view in test.views}):
+        raise InputError(
+            f"{scene}: {len(both)} photos are for training and for testing ({both[0]}): take them out of one"
+        )
+    views, absent = [*train.views, *test.views], [*train.absent, *test.absent]
+    split = f"{len(train.views)} training and {len(names)} test photos" if names else f"{len(train.views)} photos"
+    kind = f"{source}{f' and {test_file.name}' if names and test_file else ''} (NeRF-synthetic): {split}, no points"
+    absence = absence_notes(scene, source, absent, len(views) + len(absent))
+    notes = [*train.notes, *test.notes, *absence]
+    return _capture(scene, views, names or None, np.empty((0, 3)), None, kind, notes).checked(source)
+
+
+def _capture(
     scene: Path,
-    photo_folder: Path,
-    views: Mapping[str, FrameView],
-    test: np.ndarray | None,
+    views: list[FrameView],
+    test: Collection[str] | None,
     points: np.ndarray,
     colors: np.ndarray | None,
+    kind: str,
+    notes: list[str],
 ) -> Capture:
     """The capture of some frames, in the order of their photos' names.
 
     Args:
-        photo_folder: the scene, or a folder in it that has all photos.
-        test: [V] bool in that order; None: no own split.
-        points: [M, 3]; where M is 0, points are drawn about what the training cameras look at, and how is its note.
+        test: written names of the test photos; None: no own split.
+        points: [M, 3]; where M is 0, points are drawn about what the training cameras look at.
         colors: [M, 3] uint8.
+        kind: the first note, which goes on with how points were drawn.
     """
-    ordered = [views[name] for name in sorted(views)]
-    viewmats, intrinsics = np.array([view.viewmat for view in ordered]), np.array([view.K for view in ordered])
-    sizes, how = np.array([view.size for view in ordered]), ""
-    if not len(points):
-        train = slice(None) if test is None or test.all() else ~test
-        points, how = starting_points(viewmats[train], intrinsics[train], sizes[train])
-        colors = None
+    views = sorted(views, key=lambda view: view.path)
+    viewmats, Ks = np.array([view.viewmat for view in views]), np.array([view.K for view in views])
+    sizes = np.array([view.size for view in views])
+    tested = None if test is None else np.array([view.written in test for view in views])
+    if not len(points) and views:
+        train = slice(None) if tested is None or tested.all() else ~tested
+        points, how = starting_points(viewmats[train], Ks[train], sizes[train])
+        colors, kind = None, f"{kind}, so {len(points):,} random ones {how}"
+    folder = common_folder(scene, [view.path for view in views])
     return Capture(
-        names=tuple((scene / name).relative_to(photo_folder).as_posix() for name in sorted(views)),
-        photo_folder=photo_folder,
+        names=tuple((scene / view.path).relative_to(folder).as_posix() for view in views),
+        photo_folder=folder,
         viewmats=viewmats,
-        Ks=intrinsics,
+        Ks=Ks,
         sizes=sizes,
         points=points,
         point_colors=colors,
-        lenses=tuple(view.lens for view in ordered),
-        notes=(how,),
-        test=test,
-        mask_files=tuple(view.mask for view in ordered),
+        lenses=tuple(view.lens for view in views),
+        notes=(kind, *notes),
+        test=tested,
+        mask_files=tuple(view.mask for view in views),
     )
 
 
-def _file_path(frame: dict[str, Any], source: Path) -> str:
-    if not isinstance(name := frame.get("file_path"), str):
-        raise InputError(f"{source} has a frame without a file_path: export it again")
-    return name
-
-
-def _mask_file(scene: Path, frame: dict[str, Any], name: str, source: Path) -> Path | None:
-    """The mask that a frame names; `InputError` where it is not there."""
-    path = frame.get("mask_path")
-    if path is None:
-        return None
-    if not isinstance(path, str):
-        raise InputError(f"{source}: mask_path of frame '{name}' is not a path: write one, or take it out")
-    if (file := file_named(scene, path, source)) is None:
-        raise InputError(f"{source}: frame '{name}' names the mask {scene / path}, which is not there: bring it back")
-    return scene / file
-
-
-def _own_split(
-    content: dict[str, Any], found: FrameViews, scene: Path, source: Path
-) -> tuple[frozenset[str] | None, frozenset[str], str]:
-    """The split that a transforms.json states.
+def _own_split(found: FrameViews, source: Path) -> tuple[set[str], set[str]] | None:
+    """Written names of the training and of the test photos, by the lists of a ``transforms.json``; None without any.
 
     Test photos are in ``test_filenames``; where that is absent or empty, in ``val_filenames``. Where both are, all
     photos that are not for training are tests. Without ``train_filenames``, what is in no other list trains.
 
-    Returns:
-        Names of the test photos, None where the file has none of the lists; names of photos in neither part; words for
-        the note on the capture.
-
     Raises:
-        InputError: a list that is none or names a photo without a frame; a photo for training and testing; no photos to
-            train or to test on.
+        InputError: a list that is none or names a photo without a frame; lists that are no split.
     """
-    lists = {key: _listed(content[key], key, found, scene, source) for key in LISTS if key in content}
+    everything = {*(view.written for view in found.views), *found.absent}
+    lists: dict[str, set[str]] = {}
+    for key in (key for key in LISTS if key in found.content):
+        listed = found.content[key]
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            raise InputError(f"{source}: {key} is no list of file names: write one, or take it out")
+        lists[key] = {PureWindowsPath(name).as_posix() for name in listed}
+        if strange := sorted(lists[key] - everything):
+            raise InputError(f"{source}: {key} names '{strange[0]}', which is no frame's file_path: take it out")
     if not lists:
-        return None, frozenset(), ""
-    named, train = frozenset(found.written.values()), lists.get(TRAIN)
-    test_key = next((key for key in (TEST, VALIDATION) if lists.get(key)), "")
-    if not test_key and not train:
-        raise InputError(f"{source}: {' and '.join(lists)} are empty: name photos there, or take the lists out")
-    if train is None:
-        train = named - lists.get(TEST, frozenset()) - lists.get(VALIDATION, frozenset())
-    test = lists[test_key] if test_key else named - train
+        return None
+    test, validation = lists.get(TEST, set()), lists.get(VALIDATION, set())
+    train = lists.get(TRAIN, everything - test - validation)
+    test = test or validation or everything - train
     if both := sorted(train & test):
-        raise InputError(
-            f"{source}: {len(both)} photos are in {TRAIN} and in {test_key} ({both[0]}): take them out of one of them"
-        )
-    for part, what in ((train, "train"), (test, "test")):
-        if not part:
-            raise InputError(f"{source}: its lists ({', '.join(lists)}) leave no photo to {what} on: mend them")
-    unused = named - train - test
-    there = [name for name in found.views if name not in unused]
-    tested = sum(name in test for name in there)
-    left = f", {len(unused)} others not used" if unused else ""
-    origin = test_key or f"in no {TRAIN}"
-    return test, unused, f", its own split, {len(there) - tested} training and {tested} test photos ({origin}){left}"
+        raise InputError(f"{source}: {len(both)} photos are for training and for testing ({both[0]}): mend its lists")
+    if not train or not test:
+        raise InputError(f"{source}: its lists ({', '.join(lists)}) leave no photo to train or to test on: mend them")
+    return train, test
 
 
-def _listed(listed: Any, key: str, found: FrameViews, scene: Path, source: Path) -> frozenset[str]:
-    """The photos that one list names."""
-    if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-        raise InputError(f"{source}: {key} is no list of file names: write one, or take it out")
-    photos = {name: found.written.get(name) or file_named(scene, name, source, photo=True) for name in listed}
-    named = set(found.written.values())
-    if strange := [name for name, photo in photos.items() if photo not in named]:
-        more = f" and {len(strange) - 1} more" if len(strange) > 1 else ""
-        raise InputError(
-            f"{source}: {key} names '{strange[0]}'{more}, which no frame has: write it as in its frame's file_path, or "
-            "take it out"
-        )
-    return frozenset(photo for photo in photos.values() if photo)
+def _file(scene: Path, name: Any, what: str, source: Path) -> Path:
+    """A file that a transforms file names; `InputError` where it is not there."""
+    path = file_named(scene, name, source) if isinstance(name, str) else None
+    if path is None:
+        raise InputError(f"{source}: its {what}, {str(name)[:200]!r}, is not there: bring it back, or take it out")
+    return scene / path
 
 
-def _read_points(scene: Path, name: Any, source: Path) -> tuple[np.ndarray, np.ndarray]:
-    if not isinstance(name, str):
-        raise InputError(f"{source}: ply_file_path is not a path: write one, or take it out")
-    if (file := file_named(scene, name, source)) is None:
-        raise InputError(
-            f"{source}: its ply_file_path {scene / name} is not there: bring it back, or take that line out, to begin "
-            "with random points"
-        )
-    path = scene / file
+def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """[M, 3] float64 and [M, 3] uint8 of a cloud, grey where it has no colours."""
     vertices = read_vertices(path)
     if not {"x", "y", "z"} <= set(vertices):
-        raise InputError(f"{path} has no x, y, z: export it again, or take ply_file_path out of {source.name}")
+        raise InputError(f"{path} has no x, y, z: export it again, or take ply_file_path out")
     points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
     colors = read_colors(path, vertices)
     return points, np.full(points.shape, 128, dtype=np.uint8) if colors is None else colors

@@ -103,7 +103,7 @@ def from_file(path: Path, frame: Frame, frames: int) -> Cameras:
             raise InputError(f"{path}: camera {place} has neither fl_x nor a camera_angle_x in 0 .. pi")
         Ks.append(K)
         owner = f"{path}: the transform_matrix of camera {place}"
-        viewmats.append(opengl_viewmat(entry.get("transform_matrix"), f"{owner} is no matrix of 4x4 numbers", owner))
+        viewmats.append(opengl_viewmat(entry.get("transform_matrix"), owner))
     normalised = frame.normalise_poses(np.stack(viewmats))
     return interpolated(normalised, np.array(Ks), (round(width), round(height)), frames)
 

@@ -25,8 +25,7 @@ from turbogs_plugin.captures.bundle_adjustment import (
     refine_together,
 )
 from turbogs_plugin.captures.capture import LARGEST_SIDE, Capture, named
-from turbogs_plugin.captures.colmap import load_pycolmap, read_colmap, read_reconstruction, write_whole
-from turbogs_plugin.captures.kinds import camera_files
+from turbogs_plugin.captures.colmap import find_model, load_pycolmap, read_colmap, read_reconstruction, write_whole
 from turbogs_plugin.captures.mask_files import FOLDER as MASKS
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
@@ -63,7 +62,7 @@ def write_refined(scene: Path, out: Path) -> str:
     if out.exists():
         raise InputError(f"--out '{out}' exists: choose a new folder")
     require_writable(out, f"--out '{out}'")
-    found = camera_files(scene)[0] if scene.is_dir() else None
+    found = find_model(scene) if scene.is_dir() else None
     if found is None:
         raise InputError(
             f"{scene} has no COLMAP reconstruction (cameras, images and points3D in sparse/0): make one of its photos "
@@ -89,10 +88,7 @@ def write_refined(scene: Path, out: Path) -> str:
                 (folder / name).symlink_to(source.resolve(), target_is_directory=True)
             except OSError:  # a disk without links
                 shutil.copytree(source, folder / name)
-        try:
-            write_whole(_reconstruction(*found, capture, refined), folder / MODEL / "0", out)
-        except OSError as error:
-            raise InputError(f"--out '{out}' cannot be written: make room there, or choose another place") from error
+        write_whole(_reconstruction(*found, capture, refined), folder / MODEL / "0", out)
         folder.rename(out)
     return "\n".join([*capture.notes[1:], refined.text("cameras"), f"scene  {out}"])
 
@@ -151,12 +147,12 @@ def _reconstruction(model: Path, suffix: str, capture: Capture, refined: Refinem
 def _photo_folders(scene: Path, capture: Capture) -> dict[str, Path]:
     """The folders of photos, of their reduced copies and of masks, by the names that they get in the new capture."""
     photos, found = capture.photo_folder, {}
-    whole = re.sub(r"_\d+$", "", photos.name) if capture.reduction > 1 else photos.name
+    whole = re.sub(r"_\d+$", "", photos.name)
     beside = [] if photos == scene else list(photos.parent.iterdir())
     for entry in (*beside, *scene.iterdir()):
         match = re.fullmatch(rf"({re.escape(whole)}|{MASKS})(_\d+)?", entry.name)
         if match and entry.is_dir():
             found[f"{MASKS if match[1] == MASKS else PHOTOS}{match[2] or ''}"] = entry
-    if capture.reduction == 1:
+    if photos.name == whole:
         found[PHOTOS] = photos
     return found

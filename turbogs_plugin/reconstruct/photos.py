@@ -14,9 +14,9 @@ from typing import Any
 from PIL import ImageOps
 from PIL.ExifTags import IFD, Base
 
-from turbogs_plugin.captures.capture import FEWEST_PHOTOS, check_photo_name
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, require_printable
 from turbogs_plugin.captures.decoding import decoding_threads, opened_image, require_8_bits
-from turbogs_plugin.captures.kinds import capture_of_run
+from turbogs_plugin.captures.kinds import run_folder
 from turbogs_plugin.captures.photo_files import find_photos, unread
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import naming
@@ -60,7 +60,7 @@ def list_photos(folder: Path) -> tuple[Path, list[Path]]:
     reason = unread(folder)
     if not folder.is_dir():
         raise InputError(f"no such folder of photos: {folder}{f'; {reason}' if reason else ''}")
-    if where := capture_of_run(folder):
+    if where := run_folder(folder):
         raise InputError(where)
     place, paths = find_photos(folder)
     if len(paths) < FEWEST_PHOTOS:
@@ -84,7 +84,9 @@ def read_photos(folder: Path) -> list[PhotoFile]:
         InputError: as `list_photos`; names that a capture cannot have; or one that cannot be read (the first in order).
     """
     place, paths = list_photos(folder)
-    names = [check_photo_name(plain_name(path.relative_to(place)), place) for path in paths]
+    names = [plain_name(path.relative_to(place)) for path in paths]
+    for name in names:
+        require_printable(name, place)
     for name, number in Counter(names).items():
         if number > 1:
             raise InputError(f"{number} photos in {place} would be named '{name}' without spaces: rename them")
