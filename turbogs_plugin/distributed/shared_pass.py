@@ -12,7 +12,14 @@ from turbogs_plugin.distributed.in_place import InPlace
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.render_pass import Projected, Rendered, RenderOptions, ScreenGradients, ScreenRecords
+from turbogs_plugin.engine.render_pass import (
+    Projected,
+    Rendered,
+    RenderOptions,
+    ScreenGradients,
+    ScreenRecords,
+    Upstream,
+)
 from turbogs_plugin.engine.shared import SharedEngine
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
@@ -46,16 +53,16 @@ class SharedRendered(Rendered):
     def projected(self) -> Projected:
         raise NotImplementedError("the projection of all views is on no single process")
 
-    def _backward(self, upstream: dict[str, Tensor | None], with_statistics: bool) -> SharedScreen:
+    def _backward(self, upstream: Upstream, with_statistics: bool) -> SharedScreen:
         """Back-propagate this process's views to the screen."""
         plain = None
         if self._rendered is not None:
             slots = self._batch.shares[self._batch.ranks.rank].slots
-            colors, errors = upstream["color_gradients"], upstream["pixel_errors"]
-            if colors is None or upstream["alpha_gradients"] is not None or upstream["depth_gradients"] is not None:
+            if upstream.alpha_gradients is not None or upstream.depth_gradients is not None:
                 raise NotImplementedError("several processes train by gradients of colors alone")
-            own_errors = None if errors is None else errors[slots]
-            plain = self._rendered.backward(colors[slots], own_errors, with_statistics=with_statistics).plain()
+            errors = None if upstream.pixel_errors is None else upstream.pixel_errors[slots]
+            own = self._rendered.backward(upstream.color_gradients[slots], errors, with_statistics=with_statistics)
+            plain = own.plain()
         return SharedScreen(self._batch, plain, with_statistics)
 
 
