@@ -11,22 +11,20 @@ import resource
 import shutil
 import signal
 import sys
-import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 import pytest
 import torch
 from helpers.framework_runs import ENDLESS, TINY, assert_identical, tiny_config
-from helpers.processes import PRELOADED, comes_true, ended, said, start_ranks
+from helpers.processes import PRELOADED, ended, said, start_ranks
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from turbogs_plugin import cli, files
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.distributed import processes as distributed_processes
-from turbogs_plugin.distributed.processes import _Watch, joined
+from turbogs_plugin.distributed.processes import joined
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model import torch_file
@@ -36,7 +34,7 @@ from turbogs_plugin.train.clock import WallRecord
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.trainer import Trainer
 
-EXCHANGES = ("agree", "gather_numbers", "broadcast", "gather", "send_and_receive")
+EXCHANGES = ("agree", "gather_numbers", "broadcast", "exchange")
 MOMENTS = 60
 """A tiny run has more exchanges: four of its maps, four and more of each of its 14 iterations."""
 SECONDS = 30.0
@@ -92,8 +90,6 @@ def training(config: Config, out: Path, trouble: str) -> None:
         def no_capture(*arguments: object, **options: object) -> None:
             raise InputError("no such scene: absent on this machine")
 
-        if trouble == "short grace":
-            distributed_processes.GRACE_SECONDS = 1.0
         if trouble == "memory" and last:
             Trainer.step = without_memory
         if trouble == "signal" and last:
@@ -205,22 +201,6 @@ def test_trouble_of_one_process_ends_all_with_its_own_line(trouble, message, goo
         assert load_checkpoint(newest)["trainer"]["iteration"] == good
 
 
-def test_a_process_that_waits_for_one_that_hangs_ends_when_it_is_asked_to(capture, tmp_path):
-    """As on GPUs, where nothing tells a waiting process that another one is gone: the launcher asks it to end."""
-    config = tiny_config(capture, *ENDLESS)
-    processes = start_ranks(2, training, tmp_path, config, tmp_path / "run", "short grace")
-    newest = tmp_path / "run/checkpoints/iteration-000006.pt"
-    comes_true(newest.exists, 120.0)
-    os.kill(processes[1].pid, signal.SIGSTOP)
-    time.sleep(0.5)
-    processes[0].terminate()
-    assert ended(processes[:1], SECONDS) == [128 + signal.SIGTERM]
-    processes[1].kill()
-    (line,) = errors_in(said(tmp_path))
-    assert "does not answer" in line
-    assert latest_checkpoint(tmp_path / "run/checkpoints") is not None
-
-
 def test_a_signal_to_one_process_stops_and_saves_all(capture, tmp_path):
     codes, text = trained(2, tmp_path, capture, "signal", *ENDLESS)
     assert codes == [128 + signal.SIGTERM] * 2, text
@@ -245,7 +225,17 @@ def lost_once(words: list[str]) -> None:
     assert not end.value.code, end.value.code
 
 
-def test_torchrun_starts_a_lost_run_again_from_its_checkpoint(capture, tmp_path):
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Handlers of signals are set back: torchrun's agent sets its own, and leaves them."""
+    asked = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+    before = {number: signal.getsignal(number) for number in asked}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_torchrun_starts_a_lost_run_again_from_its_checkpoint(capture, tmp_path, handlers):
     """By the agent of torchrun, in this process; its processes are forked, where torchrun's begin with Python."""
     multiprocessing.get_context("forkserver").set_forkserver_preload(PRELOADED)
     endpoint = {"rdzv_backend": "c10d", "rdzv_endpoint": "localhost:0", "local_addr": "localhost"}
@@ -254,18 +244,12 @@ def test_torchrun_starts_a_lost_run_again_from_its_checkpoint(capture, tmp_path)
     run_folder = tmp_path / "run"
     words = ["train", str(capture), "--out", str(run_folder), "--device", "cpu", "--no-report", *TINY, *ENDLESS[2:]]
     words += ["train.iterations=10", "schedule.max_views=2"]
-    asked = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
-    before = {number: signal.getsignal(number) for number in asked}  # the agent sets its own, and leaves them
-    try:
-        elastic_launch(config, lost_once)(words)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    elastic_launch(config, lost_once)(words)
     assert read_history(run_folder / "history.jsonl")[-1].iteration == 10
     assert math.isnan(WallRecord.read(run_folder / "wall.json").wall_seconds), "no process was lost"
 
 
-def test_the_command_starts_processes_itself(capture, tmp_path, turbogs, monkeypatch):
+def test_the_command_starts_processes_itself(capture, tmp_path, turbogs, monkeypatch, handlers):
     settings = ("train.iterations=3", "train.refine_until=2", "train.evaluate_at=[]", "schedule.min_views=1")
     folder = tmp_path / "run"
     code, _, told = turbogs("train", capture, *settings, "--out", folder, "--gpus", 2, "--device", "cpu", "--no-report")
@@ -280,10 +264,3 @@ def test_a_process_alone_exchanges_nothing(capture):
     with joined("cpu") as ranks:
         assert ranks.count == 1 and ranks.first and ranks.agree("x") == "x" and not ranks.ask_to_stop(15)
     assert not torch.distributed.is_initialized()
-
-
-def test_a_training_of_another_thread_than_the_main_one_ends_as_well():
-    """Signals come to the main thread alone: nothing is to be set back."""
-    with ThreadPoolExecutor(1) as pool:
-        watch = pool.submit(_Watch, None, bool).result()
-        pool.submit(watch.end).result()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable
 from itertools import product
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,12 +19,9 @@ from torch import Tensor
 from turbogs_plugin.distributed import ranks_engine
 from turbogs_plugin.distributed.in_place import STEPPED, InPlace
 from turbogs_plugin.distributed.peer_memory import PeerMemory
-from turbogs_plugin.distributed.ranks_engine import RanksEngine
-from turbogs_plugin.distributed.shared_pass import SharedScreen
+from turbogs_plugin.distributed.ranks_engine import RanksEngine, SharedScreen
 from turbogs_plugin.distributed.shares import Share
-from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.render_pass import ScreenRecords
 
 CPU = torch.device("cpu")
 
@@ -74,16 +72,16 @@ class Noted:
 class Ranks:
     """What the exchange needs to know of the processes."""
 
-    reads_peers = True
     asked = 0
 
     def __init__(self, noted: Noted, rank: int, count: int) -> None:
         self._noted, self.rank, self.count = noted, rank, count
 
-    def gather(self, tensor: Tensor, gathered: Tensor) -> None:
+    def to_all(self, own: Tensor, sizes: list[int]) -> list[Tensor]:
         """The process's stream goes on when all parts have arrived."""
         self._noted.note("send")
         self._noted.meet("gather")
+        return [torch.zeros(size) for size in sizes]
 
 
 class Engine:
@@ -92,8 +90,8 @@ class Engine:
     def __init__(self, noted: Noted) -> None:
         self._noted = noted
 
-    def lend(self, memory: object) -> None:
-        pass
+    def lend(self, memory: object) -> bool:
+        return True
 
     def gather(self, *arguments: object) -> None:
         self._noted.note("read colors")
@@ -108,15 +106,13 @@ class Engine:
 class Screen(SharedScreen):
     """A pass of two views in this memory; None: by messages."""
 
-    views = 2
-
-    def __init__(self, engine: Engine, shares: list[Share], memory: InPlace | None, count: int) -> None:
-        self._arguments = engine, shares, count, None
-        self._memory, self._target = memory, ScreenRecords(torch.zeros(2, 1, ScreenRecord.SIZE), torch.zeros(2), False)
+    def __init__(self, engine: Engine, shares: list[Share], memory: InPlace | None) -> None:
+        self.batch = SimpleNamespace(samples=SimpleNamespace(view_ids=(0, 1)))
+        self._arguments, self._memory = (engine, shares), memory
 
     def of_rows(self, rows: list[slice], own: object) -> None:
         if self._memory is not None:
-            self._memory.collect(*self._arguments, self._target, 0)
+            self._memory.collect(*self._arguments, rows, None, None)
 
 
 def shared(noted: Noted, count: int) -> Callable[[Ranks, int, torch.device], PeerMemory]:
@@ -143,7 +139,7 @@ def iterations(monkeypatch: pytest.MonkeyPatch, count: int, gaussians: int, ways
     """Iterations of some processes, which say whether in place."""
     noted = Noted()
     monkeypatch.setattr(ranks_engine, "OWNERS_FROM", 0)
-    shares = [Share(slice(0, 1), slice(5 * rank, 5 * rank + 5), slice(rank, rank + 1), False) for rank in range(count)]
+    shares = [Share(slice(0, 1), slice(5 * rank, 5 * rank + 5), slice(rank, rank + 1)) for rank in range(count)]
     share, processes = shared(noted, count), []
     for rank in range(count):
         engine = RanksEngine(Engine(noted), Ranks(noted, rank, count), CPU, share)
@@ -151,12 +147,13 @@ def iterations(monkeypatch: pytest.MonkeyPatch, count: int, gaussians: int, ways
         processes.append((engine, model, GaussianMoments.zeros(model)))
     for way, (rank, (engine, model, moments)) in product(ways, enumerate(processes)):
         noted.process = rank
-        engine._lent = way and engine.memory.prepare(engine.engine, shares, len(model), CPU)
+        assert engine.memory.prepare(engine.engine, shares, len(model), CPU)
+        engine._exchange = engine.memory if way else engine.messages
         noted.note("render")  # reads the model, overwrites this process's records and colours
         if way:
-            engine.memory.colors(engine.engine, shares, torch.zeros(5, 3), 0, torch.zeros(2, dtype=torch.int32))
+            engine.memory.colors(engine.engine, shares, torch.zeros(5, 3), torch.zeros(2, dtype=torch.int32))
         noted.note("backward")  # reads the model, writes this process's records
-        screen = Screen(engine.engine, shares, engine.memory if way else None, gaussians)
+        screen = Screen(engine.engine, shares, engine.memory if way else None)
         engine.update(None, screen, model, moments, None)
     for rank in range(count):
         noted.process = rank

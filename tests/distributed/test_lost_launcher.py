@@ -82,7 +82,7 @@ def joining(launcher: str, tells: Connection) -> None:
     here = os.getpid()
     if os.fork() == 0:
         if launcher:
-            os.environ[RUN_ID] = launcher.format(here)
+            os.environ[RUN_ID] = launcher
         with joined("cpu"):
             tells.send("joined")
             while os.getppid() == here:
@@ -95,11 +95,11 @@ def joining(launcher: str, tells: Connection) -> None:
 
 @pytest.mark.parametrize(
     ("launcher", "told"),
-    [("", ["joined", "goes on"]), ("a-job", ["joined"]), ("turbogs-{}-0", ["joined"]), ("turbogs-1-0", [])],
-    ids=["none", "torchrun", "ours", "gone before"],
+    [("", ["joined", "goes on"]), ("a-job", ["joined"])],
+    ids=["none", "torchrun"],
 )
 def test_only_a_launcher_takes_its_processes_along(launcher, told, tmp_path):
-    """Without one, as under Slurm, the parent may go. `start` says who it is, should it go before they join."""
+    """Without one, as under Slurm, the parent may go."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
     reads, tells = context.Pipe(duplex=False)
@@ -108,9 +108,6 @@ def test_only_a_launcher_takes_its_processes_along(launcher, told, tmp_path):
     tells.close()
     heard = []
     try:
-        if not told:
-            assert comes_true(lambda: any(state(child)[0] == "Z" for child in started_by(parent.pid)), SECONDS)
-            parent.kill()
         while reads.poll(SECONDS):
             heard.append(reads.recv())
             parent.kill()

@@ -19,10 +19,9 @@ from torch import Tensor
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed import ranks_engine
+from turbogs_plugin.distributed.messages import rows_of
 from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, Ranks
 from turbogs_plugin.distributed.ranks_engine import RanksEngine, owners_pay
-from turbogs_plugin.distributed.replicas import digest
-from turbogs_plugin.distributed.rows import rows_of
 from turbogs_plugin.engine import Engine
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.torch_file import leaves
@@ -286,14 +285,3 @@ def test_rows_are_owned_in_aligned_runs():
         assert [part.start for part in rows[1:]] == [part.stop for part in rows[:-1]]
         assert rows[0].start == 0 and rows[-1].stop == count
         assert all(part.start % 4 == 0 or part.start == count for part in rows)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.int16, torch.float32, torch.int32, torch.float64, torch.uint8])
-def test_a_digest_sees_every_bit_and_the_order(dtype):
-    value = torch.arange(1, 9).to(dtype)
-    assert digest(value) == digest(value.clone()) == digest(value.reshape(2, 4))
-    assert digest(value) != digest(value.flip(0))
-    changed = value.clone()
-    changed.view(torch.uint8)[-1] ^= 1
-    assert digest(value) != digest(changed)
-    assert digest(value[:0]) != digest(value[:1])
