@@ -22,9 +22,7 @@ from turbogs_plugin.distributed.messages import rows_of
 from turbogs_plugin.distributed.peer_memory import PeerMemory, aligned_starts, share_memory
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.ranks_engine import RanksEngine
-from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
-from turbogs_plugin.engine.render_pass import ScreenRecords
 from turbogs_plugin.engine.shared import ModelCopies, SharedEngine
 from turbogs_plugin.model.torch_file import leaves
 from turbogs_plugin.train.loop import TrainingLoop
@@ -46,9 +44,6 @@ OF_THREE = ("usual", "one tile")
 
 STEPS = 5
 
-FIRST_ERRORS: dict[tuple[int, int], torch.Tensor] = {}
-"""(Gaussians, view) -> errors before the first step, which are the same in all cases."""
-
 scene_of = cache(load_scene)  # a trainer only reads it
 
 
@@ -65,17 +60,7 @@ def trainer_of(
     """With memory of these files, and an engine that keeps passes there."""
     engine = RanksEngine(engine or KeepingEngine(), ranks, CPU, files)
     trainer = Trainer(copy.deepcopy(config_of(capture, overrides)), scene_of(capture), CPU, engine=engine)
-    render, count = trainer.dense_errors, len(trainer.gaussians)
-
-    def errors(view: int) -> torch.Tensor:
-        """The first trainer alone renders them."""
-        if (count, view) not in FIRST_ERRORS:
-            FIRST_ERRORS[count, view] = render(view)
-        return FIRST_ERRORS[count, view].clone()
-
-    trainer.dense_errors = errors
     trainer.initialise_maps()
-    del trainer.dense_errors
     return trainer
 
 
@@ -235,22 +220,3 @@ def test_all_send_messages_if_one_cannot_share_its_memory(monkeypatch):
         assert share_memory(here := Alone(1, 1), 10, device) is None
     assert not here.others
     assert share_memory(Alone(), 10, CPU) is None
-
-
-def records(views: int, count: int, seed: int) -> ScreenRecords:
-    generator = torch.Generator().manual_seed(seed)
-    radii = torch.randint(0, 3, (views, count, 2), generator=generator, dtype=torch.int32)
-    return ScreenRecords(torch.randn(views, count, ScreenRecord.SIZE, generator=generator), radii, False)
-
-
-def test_records_of_rows_are_collected_view_after_view():
-    """Two processes share the third of four views."""
-    first, second = records(3, 9, 0), records(2, 9, 1)
-    second.radii[0] = first.radii[2]
-    target = ScreenRecords(torch.full((4, 5, ScreenRecord.SIZE), torch.nan), torch.zeros(4, 5, 2).int(), False)
-    ReferenceEngine().collect([first, second], [0, 2], target, 2)
-    rows = slice(2, 7)
-    shared = (first.records[2] + second.records[0])[rows]
-    wanted = torch.cat([first.records[:2, rows], shared[None], second.records[1:, rows]])
-    assert torch.equal(target.records, wanted)
-    assert torch.equal(target.radii, torch.cat([first.radii[:, rows], second.radii[1:, rows]]))

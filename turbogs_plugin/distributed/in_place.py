@@ -25,9 +25,6 @@ From this follows:
   and `collect`.
 - *Lost iterations* go through all of this, and write nothing. A process that has settled repeats the iteration like any
   other.
-
-**Growth.** All processes grow a memory in the same iteration, as its size is known to all, and let go of the old one,
-after a device synchronization. It lives on until none has it mapped.
 """
 
 from __future__ import annotations
@@ -63,8 +60,7 @@ class InPlace:
 
     def __init__(self, ranks: ProcessRanks, share: Sharing) -> None:
         self._ranks, self._share, self._possible = ranks, share, True
-        self._passes: PeerMemory | None = None
-        self._own: PassMemory | None = None
+        self._passes: tuple[PeerMemory, PassMemory] | None = None  # of all processes, and this one's
         self._slots = self._instances = 0  # there is room for
         self._starts: list[int] = []  # of status, colors, radii and records in a process's memory, in numbers
         self._model: PeerMemory | None = None
@@ -116,37 +112,31 @@ class InPlace:
         slots = max(share.num_slots for share in shares)
         instances = max(len(share) for share in shares) * gaussians
         if slots > self._slots or instances > self._instances:
-            # All processes come here in the same iteration, as their shares are known to all.
+            # All processes come here in one iteration, as their shares are known to all. The old memory lives on until
+            # none has it mapped.
             if self._passes is not None:
                 synchronize(device)  # unmapping waits for the device, with all threads of Python held up
                 engine.lend(None)
-                self._passes = self._own = None
+                self._passes = None
             if slots > self._slots:
                 self._slots = with_room(slots, LEAST // 8)
             if instances > self._instances:
                 self._instances = with_room(instances, LEAST // (RECORD + RADII))
             sizes = PassStatus.SIZE, 3 * self._slots, RADII * self._instances, RECORD * self._instances
             self._starts = aligned_starts(sizes)
-            self._passes = self._take(self._starts[-1], device)
-            if self._passes is not None:
-                part = self._passes.parts[self._ranks.rank]
+            memory = self._take(self._starts[-1], device)
+            if memory is not None:
+                part = memory.parts[self._ranks.rank]
                 parts = [part[start : start + size] for start, size in zip(self._starts, sizes, strict=False)]
                 status, colors, radii, records = parts
-                self._own = PassMemory(status.view(torch.int32), colors, radii.view(torch.int32), records)
-        return self._own is not None and engine.lend(self._own)
+                self._passes = memory, PassMemory(status.view(torch.int32), colors, radii.view(torch.int32), records)
+        return self._passes is not None and engine.lend(self._passes[1])
 
     def _take(self, size: int, device: torch.device) -> PeerMemory | None:
         """Memory for so many numbers of every process, or None for good."""
         memory = self._share(self._ranks, size, device) if self._possible else None
         self._possible = memory is not None
         return memory
-
-    @property
-    def _lent(self) -> tuple[PeerMemory, PassMemory]:
-        """The memory of the pass that was prepared: of all, and this process's."""
-        if self._passes is None or self._own is None:
-            raise RuntimeError("no memory is shared: prepare says so")
-        return self._passes, self._own
 
     def colors(self, engine: SharedEngine, shares: Sequence[Share], own: Tensor | None, seen: Tensor) -> Tensor:
         """[P, 3] the colours of all samples.
@@ -155,7 +145,8 @@ class InPlace:
             own: [., 3] this process's, in the memory that its engine was lent; None if it has no samples.
             seen: [2] int32, written: `SharedEngine.gather`.
         """
-        memory, lent = self._lent
+        assert self._passes is not None, "prepare says that there is no memory"
+        memory, lent = self._passes
         if self._ranks.asked:
             lent.stop.fill_(self._ranks.asked)
         memory.barrier(WRITTEN)
@@ -177,7 +168,8 @@ class InPlace:
                 views.
             target: of all views and this process's rows; overwritten, but for records that are off screen.
         """
-        memory, _ = self._lent
+        assert self._passes is not None
+        memory, _ = self._passes
         memory.barrier(DRAWN)
         drawn = [(rank, share) for rank, share in enumerate(shares) if len(share)]
         sources = [self._screen(memory.parts[rank], len(share), rows[-1].stop) for rank, share in drawn]
@@ -185,7 +177,8 @@ class InPlace:
 
     def stepped(self, model: Gaussians | None = None) -> None:
         """Put what this process enqueues next after the steps of all, and after all that the others read of it."""
-        self._lent[0].barrier(STEPPED)
+        assert self._passes is not None
+        self._passes[0].barrier(STEPPED)
 
     def _screen(self, part: Tensor, views: int, gaussians: int) -> ScreenRecords:
         """A process's records [V, N, .], laid out from the start of what its engine was lent."""

@@ -56,11 +56,7 @@ class Ranks:
 
     def meet(self, device: torch.device) -> None:
         """Connect the processes' GPUs, so that no exchange waits for it: NCCL takes up to half a second. Every process
-        must call this, and waits for the others. Another thread may exchange what lies on the host meanwhile.
-
-        Args:
-            device: of the training; where it is a CPU, nothing is left to connect.
-        """
+        must call this, and waits for the others. Another thread may exchange what lies on the host meanwhile."""
 
 
 ONE = Ranks()
@@ -165,18 +161,23 @@ def require_equal(ranks: ProcessRanks, state: dict[str, Any]) -> None:
     Raises:
         TrainingStopped: on all processes, where a tensor or a number of one differs.
     """
-    values = [(name, value) for name, value in leaves(state, "state") if isinstance(value, Tensor | int | float)]
-    plain = [repr(value.shape if isinstance(value, Tensor) else value) for _, value in values]
-    names, iteration = [name for name, _ in values], state["iteration"]
-    _require_all(ranks, names, [own == first for own, first in zip(plain, ranks.agree(plain), strict=True)], iteration)
-    equal = [not isinstance(value, Tensor) or _is_the_first_ones(ranks, value) for _, value in values]
-    _require_all(ranks, names, equal, iteration)
+    values = {name: value for name, value in leaves(state, "state") if isinstance(value, Tensor | int | float)}
+    equal = [_is_the_first_ones(ranks, value) for value in values.values()]
+    for rank, found in enumerate(ranks.gather_numbers([int(each) for each in equal])):
+        if 0 in found:
+            raise TrainingStopped(
+                f"iteration {state['iteration']}: {list(values)[found.index(0)]} of rank {rank} differs from that of "
+                "rank 0, though all make the same steps; do the GPUs and their software differ, or is one broken?"
+            )
 
 
-def _is_the_first_ones(ranks: ProcessRanks, value: Tensor) -> bool:
-    """Whether a tensor is equal to the first process's."""
-    equal = True
-    for part in value.detach().flatten().split(CHUNK):
+def _is_the_first_ones(ranks: ProcessRanks, value: Tensor | int | float) -> bool:
+    """Whether a tensor, or a number, is equal to the first process's; its size is."""
+    equal, flat = (
+        True,
+        value.detach().flatten() if isinstance(value, Tensor) else torch.tensor([value], dtype=torch.float64),
+    )
+    for part in flat.split(CHUNK):
         own = part.new_empty(len(part)).copy_(part).view(torch.uint8)  # a stride of 1, even of one element
         first = own.clone()
         ranks.broadcast(first)
@@ -184,33 +185,20 @@ def _is_the_first_ones(ranks: ProcessRanks, value: Tensor) -> bool:
     return equal
 
 
-def _require_all(ranks: ProcessRanks, names: Sequence[str], equal: Sequence[bool], iteration: int) -> None:
-    """Raise `TrainingStopped` where a process found that one of these differs from the first process's."""
-    for rank, found in enumerate(ranks.gather_numbers([int(each) for each in equal])):
-        if 0 in found:
-            raise TrainingStopped(
-                f"iteration {iteration}: {names[found.index(0)]} of rank {rank} differs from that of rank 0, though "
-                "all make the same steps; do the GPUs and their software differ, or is one broken?"
-            )
-
-
 def first_change(ranks: ProcessRanks, update: RowUpdate | None, device: torch.device) -> RowUpdate | None:
     """The first process's change of the set of Gaussians, on all."""
-    plain = None
+    tensors, plain = {}, None
     if update is not None:
-        shapes = {name: value.shape for name, value in update.values.items()}
-        plain = len(update.source), shapes, update.reset, (update.num_cloned, update.num_split, update.num_pruned)
+        tensors = {"source": update.source, "fresh": update.fresh.to(torch.uint8), **update.values}
+        places = {name: (value.shape, value.dtype) for name, value in tensors.items()}
+        plain = places, update.reset, (update.num_cloned, update.num_split, update.num_pruned)
     plain = ranks.agree(plain)
     if plain is None:
         return None
-    count, shapes, reset, counts = plain
-    if ranks.first and update is not None:
-        source, fresh = update.source, update.fresh.to(torch.uint8)
-        values = {name: value.contiguous() for name, value in update.values.items()}
-    else:
-        source = torch.empty(count, dtype=torch.int64, device=device)
-        fresh = torch.empty(count, dtype=torch.uint8, device=device)
-        values = {name: torch.empty(shape, device=device) for name, shape in shapes.items()}
-    for tensor in (source, fresh, *values.values()):
-        ranks.broadcast(tensor)
-    return RowUpdate(source, fresh.bool(), values, reset, *counts)
+    places, reset, counts = plain
+    for name, (shape, dtype) in places.items():
+        own = tensors[name].contiguous() if ranks.first else torch.empty(shape, dtype=dtype, device=device)
+        ranks.broadcast(own)
+        tensors[name] = own
+    values = {name: tensors[name] for name in places if name not in ("source", "fresh")}
+    return RowUpdate(tensors["source"], tensors["fresh"].bool(), values, reset, *counts)

@@ -10,9 +10,6 @@ function of (seed, iteration, place), so the draws of all are equal. Then
    it adds up their records, in the order of the shares;
 3. it solves for their update, and the new parameters of all rows go to all processes (236 bytes a Gaussian).
 
-Two processes with a small batch (`owners_pay`) that send messages do without 3: both get all records, and both make
-all steps.
-
 On GPUs of one host that are linked, all three are done in place (`in_place`): a process reads the others' memory, only
 the records of Gaussians on screen, and its step writes to the others' models. Elsewhere they are sent (`messages`).
 Both ways give equal results, to the bit.
@@ -65,7 +62,8 @@ more, and owners always gain."""
 
 
 def owners_pay(processes: int, views: int, gaussians: int) -> bool:
-    """Whether owners of rows should make the steps of a batch that is sent as messages, not all processes all."""
+    """Whether owners of rows should make the steps of a batch that is sent as messages. Where they should not, both
+    processes get all records and make all steps."""
     return processes > 2 or views * gaussians >= OWNERS_FROM
 
 
