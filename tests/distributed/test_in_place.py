@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -16,14 +17,12 @@ from helpers.processes import ended, grouped, said, start_ranks
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.distributed import in_place, peer_memory, ranks_engine
-from turbogs_plugin.distributed.in_place import DRAWN, STEPPED, WRITTEN, SharedModel
+from turbogs_plugin.distributed.in_place import DRAWN, STEPPED, WRITTEN, InPlace
+from turbogs_plugin.distributed.messages import rows_of
 from turbogs_plugin.distributed.peer_memory import PeerMemory, aligned_starts, share_memory
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.ranks_engine import RanksEngine
-from turbogs_plugin.distributed.rows import rows_of
-from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
-from turbogs_plugin.engine.render_pass import ScreenRecords
 from turbogs_plugin.engine.shared import ModelCopies, SharedEngine
 from turbogs_plugin.model.torch_file import leaves
 from turbogs_plugin.train.loop import TrainingLoop
@@ -45,9 +44,6 @@ OF_THREE = ("usual", "one tile")
 
 STEPS = 5
 
-FIRST_ERRORS: dict[tuple[int, int], torch.Tensor] = {}
-"""(Gaussians, view) -> errors before the first step, which are the same in all cases."""
-
 scene_of = cache(load_scene)  # a trainer only reads it
 
 
@@ -64,26 +60,17 @@ def trainer_of(
     """With memory of these files, and an engine that keeps passes there."""
     engine = RanksEngine(engine or KeepingEngine(), ranks, CPU, files)
     trainer = Trainer(copy.deepcopy(config_of(capture, overrides)), scene_of(capture), CPU, engine=engine)
-    render, count = trainer.dense_errors, len(trainer.gaussians)
-
-    def errors(view: int) -> torch.Tensor:
-        """The first trainer alone renders them."""
-        if (count, view) not in FIRST_ERRORS:
-            FIRST_ERRORS[count, view] = render(view)
-        return FIRST_ERRORS[count, view].clone()
-
-    trainer.dense_errors = errors
     trainer.initialise_maps()
-    del trainer.dense_errors
     return trainer
 
 
-def run(trainer: Trainer, ways: list[bool], possible: bool = True) -> dict:
-    """The state after a step for each of these, which say whether in place, with an evaluation in the middle."""
+def run(trainer: Trainer, ways: list[bool], possible: bool | None = True) -> dict:
+    """The state after a step for each of these, which say whether in place, with an evaluation in the middle.
+    `possible`: None where memory may end on the way."""
     for number, way in enumerate(ways):
         trainer.engine.in_place = way
         trainer.step()
-        assert trainer.engine.way == ("in place" if way and possible else "messages")
+        assert possible is None or trainer.engine.way == ("in place" if way and possible else "messages")
         if number == len(ways) // 2:
             trainer.dense_errors(0)
             trainer.complete()
@@ -105,13 +92,12 @@ def every_case(capture: Path, folder: Path) -> None:
     for name in CASES if ranks.count == 2 else OF_THREE:
         trainer = trainer_of(capture, ranks, PeerFiles(folder / f"{name}-messages"), *CASES[name])
         wanted[name] = run(trainer, [False] * STEPS)
-        for engine in (ReferenceEngine(), KeepingEngine()):
-            memory = PeerFiles(folder / f"{name}-{type(engine).__name__}")
-            trainer = trainer_of(capture, ranks, memory, *CASES[name], engine=engine)
-            number = len(trainer.gaussians)
-            same(run(trainer, [True] * STEPS), wanted[name])
-            assert len(trainer.gaussians) != number
-            assert memory.barriers == [WRITTEN, DRAWN, STEPPED] * STEPS
+        memory = PeerFiles(folder / name)
+        trainer = trainer_of(capture, ranks, memory, *CASES[name])
+        number = len(trainer.gaussians)
+        same(run(trainer, [True] * STEPS), wanted[name])
+        assert len(trainer.gaussians) != number
+        assert memory.barriers == [WRITTEN, DRAWN, STEPPED] * STEPS
     turns, files = [True, False, True, False, True], PeerFiles(folder / "turns")
     same(run(trainer_of(capture, ranks, files), turns), wanted["usual"])
     assert files.barriers.count(STEPPED) == sum(turns)
@@ -122,22 +108,21 @@ def every_case(capture: Path, folder: Path) -> None:
 
 
 def without_some_memory(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> None:
-    """Where there is no memory for the model, parameters go by messages; where there is none for passes, all does.
-    Nobody asks again. Memory that was taken before training and suffices is never replaced."""
-    in_place.LEAST = 1 << 18
-    files = PeerFiles(folder / "of passes", most=1)
-    same(run(trainer_of(capture, ranks, files), [True] * STEPS), wanted)
-    assert files.barriers == [WRITTEN, DRAWN] * STEPS and files.refused == 1
-    in_place.LEAST = 0
-    files = PeerFiles(folder / "none", most=0)
-    same(run(trainer_of(capture, ranks, files), [True] * STEPS, possible=False), wanted)
-    assert files.refused == 2 and not files.barriers
+    """Where there is no memory for passes, from the start or from the moment when it must grow, all goes by messages.
+    Nobody asks again. An engine that keeps no passes sends messages, too."""
+    for most in (1, 2):  # the first one is the model's
+        files = PeerFiles(folder / f"only {most}", most=most)
+        same(run(trainer_of(capture, ranks, files), [True] * STEPS, possible=None), wanted)
+        assert files.refused == 1 and 0 < (files.barriers.count(STEPPED) + 2 - most) < STEPS
+    files = PeerFiles(folder / "none kept")
+    same(run(trainer_of(capture, ranks, files, engine=ReferenceEngine()), [True] * STEPS, possible=False), wanted)
+    assert not files.barriers
 
 
 def growing(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> None:
     """Without room to spare, the event before the last iteration makes the memory of the model grow."""
     before = in_place.with_room
-    in_place.with_room = lambda numbers, *least: numbers
+    in_place.with_room = lambda numbers, least: numbers
     files = PeerFiles(folder / "growing")
     trainer = trainer_of(capture, ranks, files)
     counts = [len(trainer.gaussians)]
@@ -195,7 +180,7 @@ class Alone:
     rank, count = 0, 2
 
     def __init__(self, *others: int) -> None:
-        self.reads_peers, self.others = True, list(others)
+        self.others = list(others)
 
     def gather_numbers(self, values: list[int]) -> list[list[int]]:
         return [values, [self.others.pop(0)]]
@@ -203,7 +188,7 @@ class Alone:
 
 def test_a_model_may_be_placed_over_itself_and_others_have_the_same_places():
     model = random_gaussians(40)
-    memory = SharedModel(Alone(), lambda ranks, size, device: PeerMemory([torch.zeros(size) for _ in range(2)], print))
+    memory = InPlace(Alone(), lambda ranks, size, device: PeerMemory([torch.zeros(size) for _ in range(2)], print))
     whole = memory.place(model)
     half = memory.place(whole.map(lambda value: value[::2]))  # of the very memory that it overwrites
     (other,) = memory.others(half)
@@ -214,51 +199,24 @@ def test_a_model_may_be_placed_over_itself_and_others_have_the_same_places():
     assert len(set(ModelCopies(half, [other]).distances)) == 1
 
 
-def test_small_memories_grow_by_more_than_large_ones():
-    assert [peer_memory.with_room(numbers) for numbers in (0, 1, 1000, 4 << 26)] == [0, 2, 2000, 5 << 26]
-    assert [peer_memory.with_room(numbers, 9) for numbers in (0, 4, 5)] == [9, 9, 10]
-
-
-def test_there_is_no_such_memory_on_a_cpu():
-    assert share_memory(Alone(), 10, CPU) is None
-
-
 def test_all_send_messages_if_one_cannot_share_its_memory(monkeypatch):
-    """Here or there, in any step; the next steps are not begun, and it is not tried again."""
+    """Here or there, in any step; the next steps are not begun. There is none on a CPU."""
+    memory, device = PeerMemory([], print), torch.device("cuda")
 
-    def failing(*arguments: object) -> None:
+    def failing(*arguments: object) -> Iterator[PeerMemory]:
+        yield memory
         raise ValueError("no peer access\nat line 3")
 
-    for name in ("_allocate", "_map", "_prove"):
-        monkeypatch.setattr(peer_memory, name, lambda ranks, size, memory: PeerMemory([], print))
     for name in peer_memory.SETTINGS:
         monkeypatch.setenv(name, "1")
-    device = torch.device("cuda")
-    assert share_memory(Alone(1, 1, 1), 10, device) is not None
-    there = Alone(1, 0)
-    assert share_memory(there, 10, device) is None and not there.reads_peers and not there.others
-    monkeypatch.setattr(peer_memory, "_map", failing)
-    here = Alone(1, 1)
+    monkeypatch.setattr(peer_memory, "_steps", lambda *arguments: iter([memory] * 3))
+    assert share_memory(Alone(1, 1, 1), 10, device) is memory
+    for there in (Alone(0), Alone(1, 0), Alone(1, 1, 0)):
+        assert share_memory(there, 10, device) is None and not there.others
+    monkeypatch.setattr(peer_memory, "_steps", lambda *arguments: iter([memory] * 2))  # the proof fails
+    assert share_memory(Alone(1, 1, 1), 10, device) is None
+    monkeypatch.setattr(peer_memory, "_steps", failing)
     with pytest.warns(UserWarning, match=r"ValueError: no peer access\)"):
-        assert share_memory(here, 10, device) is None
-    assert not here.reads_peers and not here.others
-    assert share_memory(here, 10, device) is None
-
-
-def records(views: int, count: int, seed: int) -> ScreenRecords:
-    generator = torch.Generator().manual_seed(seed)
-    radii = torch.randint(0, 3, (views, count, 2), generator=generator, dtype=torch.int32)
-    return ScreenRecords(torch.randn(views, count, ScreenRecord.SIZE, generator=generator), radii, False)
-
-
-def test_records_of_rows_are_collected_view_after_view():
-    """Two processes share the third of four views."""
-    first, second = records(3, 9, 0), records(2, 9, 1)
-    second.radii[0] = first.radii[2]
-    target = ScreenRecords(torch.full((4, 5, ScreenRecord.SIZE), torch.nan), torch.zeros(4, 5, 2).int(), False)
-    ReferenceEngine().collect([first, second], [0, 2], target, 2)
-    rows = slice(2, 7)
-    shared = (first.records[2] + second.records[0])[rows]
-    wanted = torch.cat([first.records[:2, rows], shared[None], second.records[1:, rows]])
-    assert torch.equal(target.records, wanted)
-    assert torch.equal(target.radii, torch.cat([first.radii[:, rows], second.radii[1:, rows]]))
+        assert share_memory(here := Alone(1, 1), 10, device) is None
+    assert not here.others
+    assert share_memory(Alone(), 10, CPU) is None

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
 from helpers.framework_runs import ENDLESS, TINY
-from helpers.processes import PRELOADED, comes_true
+from helpers.processes import comes_true
 
-from turbogs_plugin.distributed.processes import RUN_ID, joined
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="by a call of Linux")
@@ -75,48 +71,3 @@ def test_processes_of_a_training_end_with_their_launcher(capture, tmp_path):
     newest = latest_checkpoint(checkpoints)
     iteration = load_checkpoint(newest)["trainer"]["iteration"]
     assert iteration >= 3 and newest.name == f"iteration-{iteration:06d}.pt"
-
-
-def joining(launcher: str, tells: Connection) -> None:
-    """Start a process that joins a training, and wait to be killed."""
-    here = os.getpid()
-    if os.fork() == 0:
-        if launcher:
-            os.environ[RUN_ID] = launcher.format(here)
-        with joined("cpu"):
-            tells.send("joined")
-            while os.getppid() == here:
-                time.sleep(0.01)
-            time.sleep(0.1)  # whoever is to be killed is
-            tells.send("goes on")
-        os._exit(0)
-    signal.pause()
-
-
-@pytest.mark.parametrize(
-    ("launcher", "told"),
-    [("", ["joined", "goes on"]), ("a-job", ["joined"]), ("turbogs-{}-0", ["joined"]), ("turbogs-1-0", [])],
-    ids=["none", "torchrun", "ours", "gone before"],
-)
-def test_only_a_launcher_takes_its_processes_along(launcher, told, tmp_path):
-    """Without one, as under Slurm, the parent may go. `start` says who it is, should it go before they join."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(PRELOADED)
-    reads, tells = context.Pipe(duplex=False)
-    parent = context.Process(target=joining, args=(launcher, tells))
-    parent.start()
-    tells.close()
-    heard = []
-    try:
-        if not told:
-            assert comes_true(lambda: any(state(child)[0] == "Z" for child in started_by(parent.pid)), SECONDS)
-            parent.kill()
-        while reads.poll(SECONDS):
-            heard.append(reads.recv())
-            parent.kill()
-    except EOFError:  # no process is left that could tell
-        pass
-    finally:
-        parent.kill()
-        parent.join()
-    assert heard == told

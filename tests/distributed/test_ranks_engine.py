@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_settings
-from helpers.losing_engine import LosingEngine
 from helpers.processes import ended, grouped, said, start_ranks
 from PIL import Image
 from torch import Tensor
@@ -19,14 +18,11 @@ from torch import Tensor
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed import ranks_engine
+from turbogs_plugin.distributed.messages import rows_of
 from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, Ranks
-from turbogs_plugin.distributed.ranks_engine import RanksEngine, owners_pay
-from turbogs_plugin.distributed.replicas import digest
-from turbogs_plugin.distributed.rows import rows_of
 from turbogs_plugin.engine import Engine
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.torch_file import leaves
-from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -121,24 +117,8 @@ def every_case(capture: Path, out: Path, cases: tuple[str, ...]) -> None:
             results[name]["event"] = steps_with_an_event(trainer)
     ranks_engine.OWNERS_FROM = 0
     results["broken"] = broken_ranks(capture, ranks)
-    results["lost"] = lost_iterations(capture, ranks)
     if ranks.first:
         torch.save(results, out / "results.pt")
-
-
-def lost_iterations(capture: Path, ranks: ProcessRanks) -> dict:
-    """One process has too little memory for one pass: all repeat it."""
-    views = ("schedule.min_views=4", "schedule.max_views=4", "density.type=none")
-    engine = LosingEngine(2 if ranks.rank == ranks.count - 1 else None)
-    trainer = trainer_of(capture, *views, engine=RanksEngine(engine, ranks, CPU))
-    trainer.initialise_maps()
-    loop = TrainingLoop(trainer)
-    loop.advance(2)  # the loss is known at this mark alone
-    trainer.complete()
-    loop.advance(8)
-    trainer.complete()
-    updates = int(trainer.optimizer.moments.steps.max())
-    return {"passes": engine.passes, "recovered": engine.recovered, "updates": updates}
 
 
 def broken_ranks(capture: Path, ranks: ProcessRanks) -> dict:
@@ -262,22 +242,11 @@ def test_what_is_not_finite_in_one_process_is_skipped_by_all(several):
     assert results["broken"]["finite"]
 
 
-def test_an_iteration_that_one_process_lost_is_repeated_by_all(several):
-    _, results = several
-    assert results["lost"] == {"passes": 9, "recovered": 1, "updates": 8}
-
-
 def test_replicas_that_differ_end_the_run(several):
     count, results = several
     message = results["broken"]["differs"]
     assert f"gaussians.means of rank {count - 1} differs from that of rank 0" in message
     assert message.startswith("iteration 4:")
-
-
-def test_two_processes_own_rows_where_that_was_measured_to_pay():
-    measured = {(10, 150_000): False, (3, 600_000): False, (5, 600_000): False, (10, 600_000): True}
-    assert {batch: owners_pay(2, *batch) for batch in measured} == measured
-    assert owners_pay(4, 3, 1000)
 
 
 def test_rows_are_owned_in_aligned_runs():
@@ -286,14 +255,3 @@ def test_rows_are_owned_in_aligned_runs():
         assert [part.start for part in rows[1:]] == [part.stop for part in rows[:-1]]
         assert rows[0].start == 0 and rows[-1].stop == count
         assert all(part.start % 4 == 0 or part.start == count for part in rows)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.int16, torch.float32, torch.int32, torch.float64, torch.uint8])
-def test_a_digest_sees_every_bit_and_the_order(dtype):
-    value = torch.arange(1, 9).to(dtype)
-    assert digest(value) == digest(value.clone()) == digest(value.reshape(2, 4))
-    assert digest(value) != digest(value.flip(0))
-    changed = value.clone()
-    changed.view(torch.uint8)[-1] ^= 1
-    assert digest(value) != digest(changed)
-    assert digest(value[:0]) != digest(value[:1])

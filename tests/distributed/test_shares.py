@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from turbogs_plugin.distributed.shares import NEARLY, shares_of
+from turbogs_plugin.distributed.shares import NEARLY, Share, shares_of
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
@@ -34,6 +34,15 @@ def samples_of(
     return ErrorGuidedPixelSampler(unit=unit).sample(maps, tuple(range(views)), rate, Step(3, 10, 8))
 
 
+def seen_views(shares: list[Share], views: int) -> list[int]:
+    """Views of all shares in their order; a share may go on with the last view of the share before."""
+    seen: list[int] = []
+    for share in shares:
+        own = list(range(views)[share.views])
+        seen += own[1:] if seen[-1:] == own[:1] else own
+    return seen
+
+
 @pytest.mark.parametrize("unit", ["pixel", "tile"])
 @pytest.mark.parametrize("count", [2, 3, 8])
 @pytest.mark.parametrize("views", [1, 3, 6])
@@ -45,8 +54,7 @@ def test_shares_are_the_samples_in_their_order(sizes, views, count, unit, masked
     assert len(shares) == count
     parts = [samples.of_tiles(share.tiles, share.views, share.slots) for share in shares if len(share)]
     assert torch.equal(torch.cat([part.pixel_ids for part in parts]), samples.pixel_ids)
-    begun = [view for share in shares for view in range(views)[share.begun]]
-    assert begun == list(range(views))
+    assert seen_views(shares, views) == list(range(views))
     of_slots = samples.view_of_slot()
     for share, part in zip([share for share in shares if len(share)], parts, strict=True):
         assert torch.equal(part.view_of_slot() + share.views.start, of_slots[share.slots])
@@ -66,14 +74,8 @@ def test_shares_are_nearly_even(views, count):
     assert max(abs(size - even) for size in sizes) <= 2 * (NEARLY * even + tile)
 
 
-def test_a_view_of_several_shares_begins_in_the_first():
-    shares = shares_of(samples_of(EQUAL, 3), 2)
-    assert [share.views for share in shares] == [slice(0, 2), slice(1, 3)]
-    assert [share.continues for share in shares] == [False, True]
-    assert [share.begun for share in shares] == [slice(0, 2), slice(2, 3)]
-
-
-def test_processes_without_samples_have_no_views():
+def test_views_of_several_shares_and_of_none():
+    assert [share.views for share in shares_of(samples_of(EQUAL, 3), 2)] == [slice(0, 2), slice(1, 3)]
     shares = shares_of(samples_of(EQUAL, 1, "tile", 1e-3), 4)
     assert sorted(len(share) for share in shares) == [0, 0, 0, 1]
 
@@ -85,7 +87,7 @@ def test_a_view_without_samples_is_begun_once(empty, count):
     masks = PixelMasks.from_images([np.full((96, 160), view not in empty) for view in range(6)])
     samples = samples_of(EQUAL, 3, masks=masks)
     shares = shares_of(samples, count)
-    assert [view for share in shares for view in range(3)[share.begun]] == [0, 1, 2]
+    assert seen_views(shares, 3) == [0, 1, 2]
     assert sum(share.num_slots for share in shares) == len(samples)
 
 

@@ -7,8 +7,8 @@ import torch
 from helpers.raster_cases import GPU_ONLY, make_case
 
 from turbogs_plugin.distributed.in_place import InPlace
+from turbogs_plugin.distributed.messages import rows_of
 from turbogs_plugin.distributed.peer_memory import PeerMemory
-from turbogs_plugin.distributed.rows import rows_of
 from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda.engine import CudaEngine
@@ -110,7 +110,7 @@ def test_passes_in_memory_that_is_lent():
 class OneOfTwo:
     """What `InPlace` needs to know of the processes."""
 
-    count = 2
+    count, asked = 2, 0
 
     def __init__(self, rank: int) -> None:
         self.rank = rank
@@ -124,13 +124,13 @@ def in_place_like_twin(
     Returns:
         How many Gaussians are on screen, in all views.
     """
-    shares, device, parts = shares_of(samples, 2), samples.pixel_ids.device, []
+    shares, device, memory_parts = shares_of(samples, 2), samples.pixel_ids.device, []
 
     def share(ranks: OneOfTwo, size: int, device: torch.device) -> PeerMemory:
-        while len(parts) < 2:
-            parts.append(torch.zeros(size, device=device))
-        assert len(parts[0]) == size
-        return PeerMemory(parts, lambda channel: None)
+        while len(memory_parts) < 2:
+            memory_parts.append(torch.zeros(size, device=device))
+        assert len(memory_parts[0]) == size
+        return PeerMemory(memory_parts, lambda channel: None)
 
     memories = [InPlace(OneOfTwo(rank), share) for rank in range(2)]
     rendered = []
@@ -142,13 +142,14 @@ def in_place_like_twin(
             part = Cameras(cameras.viewmats[own.views], cameras.Ks[own.views], cameras.sizes[own.views])
             last = engine.render(gaussians, part, chosen, DEFAULT_OPTIONS)
         rendered.append(last)
-        memory.colors(engine, shares, last.colors, 0, flags)
+        memory.colors(engine, shares, last.colors, flags)
     for memory, engine, one in zip(memories, engines, rendered, strict=True):
-        colors = memory.colors(engine, shares, one.colors, 0, flags)
+        colors = memory.colors(engine, shares, one.colors, flags)
         assert torch.equal(colors, torch.cat([each.colors for each in rendered])) and flags.tolist() == [0, 0]
     plains = [one.backward(torch.ones_like(one.colors)).plain() for one in rendered]
     seen = 0
-    for rank, rows in enumerate(rows_of(len(gaussians), 2)):
+    parts = rows_of(len(gaussians), 2)
+    for rank, rows in enumerate(parts):
         shape = len(cameras), rows.stop - rows.start
         target, wanted = (
             ScreenRecords(
@@ -158,9 +159,7 @@ def in_place_like_twin(
             )
             for _ in range(2)
         )
-        own = plains[1 - rank], memories[1 - rank]
-        own[1].collect(engines[1 - rank], shares, len(gaussians), own[0], target, rows.start)  # has copied, if it must
-        memories[rank].collect(engines[rank], shares, len(gaussians), plains[rank], target, rows.start)
+        memories[rank].collect(engines[rank], shares, parts, plains[rank], target)
         collect_records(plains, [one.views.start for one in shares], wanted, rows.start)
         assert torch.equal(target.radii, wanted.radii)
         on_screen = (wanted.radii > 0).any(dim=-1)

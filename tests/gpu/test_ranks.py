@@ -19,7 +19,6 @@ from PIL import Image
 from turbogs_plugin.captures import write_demo_capture
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed.processes import start
-from turbogs_plugin.distributed.replicas import digest
 from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenRecords
@@ -88,11 +87,6 @@ def test_runs_of_rows_make_the_step_of_all_rows(optimizer, unit):
     assert int(moments.steps.max()) == 1
 
 
-def test_a_digest_is_the_same_on_both_devices():
-    value = torch.randn(5_000_011, generator=torch.Generator().manual_seed(0))
-    assert digest(value) == digest(value.to(GPU))
-
-
 OTHERS = {
     "fastgs": ("density.type=fastgs", "density.refine_from=20", "density.refine_every=20"),
     "mcmc": ("density.type=mcmc", "density.refine_start_iter=20", "density.refine_every=20"),
@@ -159,4 +153,4 @@ def test_a_process_that_is_killed_ends_the_one_that_waits_on_its_gpu(tmp_path: P
     told = tmp_path / "told"
     with suppress(TrainingStopped):  # of processes that were killed before they could say a word
         assert start(2, ["dying", str(capture), str(told)], "cuda", "helpers.in_place_case") != 0
-    assert time.time() - float(told.read_text()) < 30
+    assert time.time() - float(told.read_text()) < 45, "the launcher kills what does not end in 30 s"

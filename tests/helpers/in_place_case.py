@@ -17,11 +17,10 @@ import torch
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed.in_place import InPlace
+from turbogs_plugin.distributed.messages import Messages, gather_rows
 from turbogs_plugin.distributed.processes import joined
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
-from turbogs_plugin.distributed.ranks_engine import RanksEngine
-from turbogs_plugin.distributed.rows import RowGather
-from turbogs_plugin.distributed.shared_pass import SharedScreen
+from turbogs_plugin.distributed.ranks_engine import RanksEngine, SharedScreen
 from turbogs_plugin.engine.cuda import workspace
 from turbogs_plugin.engine.render_pass import ScreenRecords
 from turbogs_plugin.train.loop import TrainingLoop
@@ -69,32 +68,29 @@ class Kept:
         update(engine, rule, screen, model, *more)
         owned = engine._owned
         if owned is not None:  # else all processes made all steps
-            self.arrived_in_place += engine.way == "in place" and owned.copies is not None
+            self.arrived_in_place += engine.way == "in place"
             self.parameters.append((owned.rows, owned.gaussians.map(torch.clone), model.map(torch.clone)))
 
     def compare(self, ranks: ProcessRanks) -> None:
         for (owner, name), method in self._before.items():
             setattr(owner, name, method)
+        messages, engine = Messages(ranks), None  # which need no engine to collect
         for screen, rows, records, radii in self.screens:
             target = ScreenRecords(torch.empty_like(records), torch.empty_like(radii), False)
-            screen._send_and_receive(rows, target)
+            messages.collect(engine, screen.batch.shares, rows, screen._plain, target)
             assert torch.equal(radii, target.radii)
             seen = (radii > 0).any(dim=-1)
             # A pass that overflows draws nothing: what lies there may be NaN.
             torch.testing.assert_close(records[seen], target.records[seen], rtol=0, atol=0, equal_nan=True)
         for shares, own, found in self.colors:
-            counts = [share.num_slots for share in shares]
-            sent = found.new_zeros(max(counts), 3)
-            if own is not None:
-                sent[: len(own)] = own
-            parts = zip(ranks.gather(sent), counts, strict=True)
-            colors = torch.cat([part[:count] for part, count in parts])
-            torch.testing.assert_close(colors, found, rtol=0, atol=0, equal_nan=True)
+            own = found[:0] if own is None else own
+            colors = torch.cat(ranks.to_all(own.flatten(), [3 * share.num_slots for share in shares]))
+            torch.testing.assert_close(colors.view(-1, 3), found, rtol=0, atol=0, equal_nan=True)
         for rows, own, found in self.parameters:
             sent = found.map(torch.zeros_like)
             for name, value in sent.items():
                 value[rows[ranks.rank]] = getattr(own, name)
-            RowGather(ranks, [value for _, value in sent.items()], rows)()
+            gather_rows(ranks, [value for _, value in sent.items()])
             for name, value in found.items():
                 assert torch.equal(getattr(sent, name), value), name
 

@@ -40,7 +40,7 @@ class PeerFiles:
         self.barriers: list[int] = []
 
     def __call__(self, ranks: ProcessRanks, size: int, device: torch.device) -> PeerMemory | None:
-        if len(self.sizes) == self.most:
+        if self.most is not None and len(self.sizes) >= self.most:
             self.refused += 1
             return None
         paths = [self.folder / f"{len(self.sizes)}-{rank}" for rank in range(ranks.count)]
@@ -92,8 +92,12 @@ class KeepingEngine(LosingEngine):
         super().__init__(lose)
         self.lent: PassMemory | None = None
 
-    def lend(self, memory: PassMemory | None) -> None:
+    def lend(self, memory: PassMemory | None) -> bool:
+        if memory is not self.lent:
+            flag = torch.zeros(1, dtype=torch.int32) if memory is None else memory.overflow
+            self.flag = flag.copy_(self.flag)
         self.lent = memory
+        return True
 
     def views(self, views: int, count: int) -> tuple[Tensor, Tensor]:
         size = views * count

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +16,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import TINY, assert_identical, stop_after, tiny_config, tiny_settings
+from helpers.framework_runs import assert_identical, stop_after, tiny_config, tiny_settings
 from helpers.processes import PRELOADED, ended
 from PIL import Image
 
@@ -28,7 +27,6 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.report.run_report import write_report
-from turbogs_plugin.strategies.density import fastgs, gsplat_default
 from turbogs_plugin.strategies.protocols import PixelSampler, SparseLoss
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
@@ -227,23 +225,8 @@ def test_a_model_without_gaussians_ends_the_run_with_a_reason(capture, tmp_path,
         run.train(tiny_config(capture), tmp_path / "run")
 
 
-@pytest.mark.parametrize(
-    "density",
-    [
-        ("density.type=error_driven",),
-        ("density.type=gsplat_default", "density.refine_start_iter=2"),
-        ("density.type=fastgs", "density.refine_from=3"),
-    ],
-)
-def test_rows_are_in_the_order_of_space_whatever_added_them(capture, density, monkeypatch):
-    monkeypatch.setattr(fastgs, "CONSISTENCY", 0.01)
-    eager = partial(gsplat_default._FilledStrategy, grow_grad2d=1e-6)
-    monkeypatch.setattr(gsplat_default, "_FilledStrategy", eager)
-    shared = [text for text in TINY if not text.startswith("density.")]
-    overrides = [*shared, "train.device=cpu", *density, "density.refine_every=3"]
-    start = ["density.refine_from=2"] if "error" in density[0] else []
-    config = load_config("turbogs", [*overrides, *start]).without_plan()
-    trainer = Trainer(config, load_scene(capture), torch.device("cpu"))
+def test_rows_are_in_the_order_of_space_whatever_added_them(capture):
+    trainer = Trainer(tiny_config(capture).without_plan(), load_scene(capture), torch.device("cpu"))
     count = len(trainer.gaussians)
     trainer.initialise_maps()
     while len(trainer.gaussians) == count:
@@ -299,30 +282,23 @@ def moved(by: pycolmap.Sim3d):
     return lambda reconstruction: reconstruction.transform(by)
 
 
-def zoomed(reconstruction) -> None:
-    for camera in reconstruction.cameras.values():
-        camera.params = camera.params * [1.01, 1.01, 1, 1]
-
-
 def renamed(reconstruction) -> None:
     """Two photos change places."""
     images = sorted(reconstruction.images.values(), key=lambda image: image.name)
     images[1].name, images[2].name = images[2].name, images[1].name
 
 
-TURN, STAY = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.01, 1.0])), pycolmap.Rotation3d()
+TURN = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.01, 1.0]))
 
 
 @pytest.mark.parametrize(
     ("change", "difference"),
     [
         (moved(pycolmap.Sim3d(1.0, TURN, np.zeros(3))), "other cameras of train images"),
-        (moved(pycolmap.Sim3d(2.0, STAY, np.zeros(3))), "other coordinates"),
-        (moved(pycolmap.Sim3d(1.0, STAY, np.ones(3))), "other coordinates"),
-        (zoomed, "other cameras of train images"),
+        (moved(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(), np.zeros(3))), "other coordinates"),
         (renamed, "other cameras of train images"),
     ],
-    ids=["turned", "scaled", "moved", "zoomed", "renamed"],
+    ids=["turned", "scaled", "renamed"],
 )
 def test_a_capture_made_anew_since_the_run_began_is_refused(elsewhere, tmp_path, change, difference):
     reconstruction = pycolmap.Reconstruction(elsewhere / "sparse" / "0")
@@ -388,30 +364,10 @@ def test_every_alternative_trains(capture, tmp_path, overrides):
     assert outcome.history[-1].psnr > outcome.history[0].psnr
 
 
-def test_the_paper_taken_literally_stays_finite(capture, tmp_path):
-    config = load_config("turbogs-paper", [*TINY, "train.device=cpu"])
-    config.scene.path = str(capture)
-    outcome = run.train(config, tmp_path / "run")
-    assert outcome.history[-1].nonfinite_losses == 0
-    assert all(value.isfinite().all() for value in saved(tmp_path / "run")["gaussians"].values())
-
-
 def test_more_views_an_iteration_than_a_gpu_takes_are_refused_before_anything_is_written():
     config = load_config("turbogs", ["schedule.max_views=200", "train.refine_cameras=false"]).without_plan()
     with pytest.raises(InputError, match=r"150 views an iteration, and a GPU takes at most 128: ask for fewer"):
         run.new_loop(config, SimpleNamespace(train=range(150)), torch.device("cuda"))
-
-
-def test_wrong_input_that_is_found_while_training_names_the_last_good_checkpoint(capture, tmp_path, monkeypatch):
-    """As a pass with more intersections than one can have."""
-
-    def refuse(self, wait=False):
-        if self.iteration == 9:
-            raise InputError("too many intersections")
-
-    monkeypatch.setattr(Trainer, "repeat_lost", refuse)
-    with pytest.raises(TrainingStopped, match=r"too many intersections; the last good checkpoint is '.*0007"):
-        run.train(tiny_config(capture, "train.checkpoint_every=7"), tmp_path / "run")
 
 
 class OwnSampler(PixelSampler):
@@ -421,11 +377,6 @@ class OwnSampler(PixelSampler):
         return PixelSamples.from_mask(torch.ones(len(view_ids), 40, 48, dtype=torch.bool))
 
 
-class TensorSampler(PixelSampler):
-    def sample(self, maps, view_ids, rate, step):
-        return torch.zeros(3, 2)
-
-
 class OwnLoss(SparseLoss):
     """A loss whose error of a pixel has three numbers."""
 
@@ -433,22 +384,11 @@ class OwnLoss(SparseLoss):
         return LossOutput((colors - targets).square().mean(), colors - targets, (colors - targets).abs())
 
 
-class ScalarLoss(SparseLoss):
-    def __call__(self, colors, targets, samples):
-        return 0.5
-
-
 @pytest.mark.parametrize(
     ("part", "strategy", "message"),
     [
         ("pixel_sampler", OwnSampler, r"returned samples of views \(0, .*, asked for .*give view_ids to PixelSamples"),
-        (
-            "pixel_sampler",
-            TensorSampler,
-            r"pixel_sampler.type 'error_guided' returned a tensor of shape \(3, 2\), not P",
-        ),
         ("loss", OwnLoss, r"returned a tensor of shape \(\d+, 3\) as pixel_errors, not a tensor of shape \(\d+,\)"),
-        ("loss", ScalarLoss, r"loss.type 'charbonnier_ncc' returned 'float', not a LossOutput"),
     ],
 )
 def test_what_a_strategy_of_ones_own_returns_is_refused_and_nothing_is_left(

@@ -5,12 +5,12 @@ and the next iteration's writing. Barriers have their own numbers, as two proces
 
 - `WRITTEN`: colours and flags of all are written -> they are read.
 - `DRAWN`: records and radii of all are complete -> they are collected.
-- `STEPPED`: all owners have written the new parameters of their rows into the models of all (`SharedModel`), or, with
-  an optimizer of own code, all have collected what they need.
+- `STEPPED`: all owners have written the new parameters of their rows into the models of all, or, with an optimizer of
+  own code, all have collected what they need.
 
 `DRAWN` does not stand for `WRITTEN`, as the loss needs the colours before. A process without samples, or without rows,
-comes to all barriers. All processes enqueue the same barriers and messages in the same order, and none needs one that
-was enqueued later. So none waits for ever.
+comes to all barriers. All processes enqueue barriers and messages in one order, and none needs one that was enqueued
+later. So none waits for ever.
 
 **Parameters** are written by the owner's step itself into the models of all. Per iteration, a process's stream has
 
@@ -22,19 +22,14 @@ From this follows:
   screen; what they still read of the model before `STEPPED` are rows of their own, which nobody else writes.
 - *What is rendered has arrived:* it comes after `STEPPED`, and so does everything else that reads a model.
 - *A pass overwrites nothing that is still read.* A process comes to `STEPPED` behind what it read of others in `colors`
-  and `collect`. Where parameters go by messages, their gather does what `STEPPED` does: it is enqueued after what was
-  read, and a process has all rows after every process's own came.
+  and `collect`.
 - *Lost iterations* go through all of this, and write nothing. A process that has settled repeats the iteration like any
   other.
-
-**Growth.** All processes grow a memory in the same iteration, as its size is known to all, and let go of the old one,
-after a device synchronization. It lives on until none has it mapped.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -51,176 +46,25 @@ from turbogs_plugin.types import Gaussians
 WRITTEN, DRAWN, STEPPED = 1, 2, 3
 """Numbers of the barriers. Number 0 is `peer_memory`'s own."""
 
-INSTANCE = 2 + ScreenRecord.SIZE
-"""Numbers of radii and record of a Gaussian in a view."""
-
-
-@dataclass
-class _Passes:
-    """Memory of all processes for a pass.
-
-    Args:
-        memory: every process's, of one size.
-        slots, instances: there is room for.
-        starts: where status, colors, radii and records begin in a process's memory, in numbers.
-        own: this process's.
-        views: (rank, views, Gaussians) -> what lies in memory for these.
-    """
-
-    memory: PeerMemory
-    slots: int
-    instances: int
-    starts: list[int]
-    own: PassMemory
-    views: dict[tuple[int, int, int], ScreenRecords] = field(default_factory=dict)
+RECORD, RADII = ScreenRecord.SIZE, 2
+"""Numbers of a record, and radii, of a Gaussian in a view."""
 
 
 class InPlace:
-    """This process's memory for a pass, and the views of every process's.
+    """This process's memory for passes and for the model, and views of every process's.
 
     Args:
         ranks: all processes.
-        share: gives memory that all read, or None.
+        share: gives memory that all read and write, or None; it is not asked again then.
     """
 
     def __init__(self, ranks: ProcessRanks, share: Sharing) -> None:
-        self._ranks, self._share = ranks, share
-        self._held: _Passes | None = None
-        self._possible = True
-
-    def reserve(self, device: torch.device) -> None:
-        """Take memory before training, enough for what most captures begin with; `prepare` replaces it where it is too
-        little. It takes processes longer to map each other's memory than to make an iteration. Every process must call
-        this."""
-        if self._possible and self._held is None:
-            self._take(LEAST // 8, LEAST // INSTANCE, device)
-
-    def prepare(self, engine: SharedEngine, shares: Sequence[Share], gaussians: int, device: torch.device) -> bool:
-        """Make room for a pass, which the engine keeps in this memory. Every process must call this.
-
-        Args:
-            gaussians: N.
-
-        Returns:
-            False: there is no such memory, for none of the processes.
-        """
-        slots = max(share.num_slots for share in shares)
-        instances = max(len(share) for share in shares) * gaussians
-        held = self._held
-        if self._possible and (held is None or slots > held.slots or instances > held.instances):
-            # All processes come here in the same iteration, as their shares are known to all.
-            present = (0, 0) if held is None else (held.slots, held.instances)
-            if held is not None:
-                synchronize(device)  # unmapping waits for the device, with all threads of Python held up
-                engine.lend(None)
-                self._held = held = None
-            slots = with_room(3 * slots) // 3 if slots > present[0] else present[0]
-            enough = instances <= present[1]
-            self._take(slots, present[1] if enough else with_room(INSTANCE * instances, LEAST) // INSTANCE, device)
-        if self._held is None:
-            return False
-        engine.lend(self._held.own)
-        return True
-
-    def _take(self, slots: int, instances: int, device: torch.device) -> None:
-        """Take memory for so much, or learn that there is none."""
-        sizes = (PassStatus.SIZE, 3 * slots, 2 * instances, ScreenRecord.SIZE * instances)
-        starts = aligned_starts(sizes)
-        memory = self._share(self._ranks, starts[-1], device)
-        self._possible = memory is not None
-        if memory is not None:
-            part = memory.parts[self._ranks.rank]
-            parts = (part[start : start + size] for start, size in zip(starts, sizes, strict=False))
-            status, colors, radii, records = parts
-            own = PassMemory(status.view(torch.int32), colors, radii.view(torch.int32), records)
-            self._held = _Passes(memory, slots, instances, starts, own)
-
-    @property
-    def _lent(self) -> _Passes:
-        """The memory of the pass that was prepared."""
-        if self._held is None:
-            raise RuntimeError("no memory is shared: prepare says so")
-        return self._held
-
-    def colors(
-        self, engine: SharedEngine, shares: Sequence[Share], own: Tensor | None, stop: int, seen: Tensor
-    ) -> Tensor:
-        """[P, 3] the colours of all samples.
-
-        Args:
-            own: [., 3] this process's; None if it has no samples.
-            stop: number of the signal by which this process wants all to stop; 0: none.
-            seen: [2] int32, written: `SharedEngine.gather`.
-        """
-        held, overflow = self._lent, engine.overflow
-        if own is not None and own.data_ptr() != held.own.colors.data_ptr():
-            held.own.colors[: own.numel()].copy_(own.reshape(-1))  # of an engine that keeps no memory
-        if overflow is not None and overflow.data_ptr() != held.own.overflow.data_ptr():
-            held.own.overflow.copy_(overflow)
-        if stop:
-            held.own.stop.fill_(stop)
-        held.memory.barrier(WRITTEN)
-        return engine.gather(held.memory.parts, held.starts[1], [share.num_slots for share in shares], seen)
-
-    def collect(
-        self,
-        engine: SharedEngine,
-        shares: Sequence[Share],
-        gaussians: int,
-        own: ScreenRecords | None,
-        target: ScreenRecords,
-        row: int,
-    ) -> None:
-        """Collect the records of all views for some rows.
-
-        Args:
-            gaussians: N.
-            own: of this process's views and all Gaussians; None if it has no views.
-            target: of all views and the rows from `row` on; overwritten, but for records that are off screen.
-        """
-        sources = [self._screen_of(rank, len(share), gaussians) for rank, share in enumerate(shares) if len(share)]
-        if own is not None:
-            kept = self._screen_of(self._ranks.rank, len(own.records), gaussians)
-            if kept.records.data_ptr() != own.records.data_ptr() or kept.radii.data_ptr() != own.radii.data_ptr():
-                kept.records.copy_(own.records)  # of an engine that keeps no memory
-                kept.radii.copy_(own.radii)
-        self._lent.memory.barrier(DRAWN)
-        engine.collect(sources, [share.views.start for share in shares if len(share)], target, row)
-
-    def stepped(self) -> None:
-        """What this process enqueues next comes after the steps of all, and after all that the others read of it."""
-        self._lent.memory.barrier(STEPPED)
-
-    def _screen_of(self, rank: int, views: int, gaussians: int) -> ScreenRecords:
-        """A process's records of its views and all Gaussians, laid out from the start of what its engine was lent.
-
-        Kept for these sizes: slicing takes the host as long as a launch does.
-        """
-        held, key = self._lent, (rank, views, gaussians)
-        if key not in held.views:
-            part, (_, _, radii, records, _) = held.memory.parts[rank], held.starts
-            count = views * gaussians
-            held.views[key] = ScreenRecords(
-                part[records : records + ScreenRecord.SIZE * count].view(views, gaussians, ScreenRecord.SIZE),
-                part[radii : radii + 2 * count].view(torch.int32).view(views, gaussians, 2),
-                with_statistics=False,
-            )
-        return held.views[key]
-
-
-class SharedModel:
-    """This process's memory for the model, and the models of the others.
-
-    Args:
-        ranks: all processes.
-        share: gives memory that all write to, or None.
-    """
-
-    def __init__(self, ranks: ProcessRanks, share: Sharing) -> None:
-        self._ranks, self._share = ranks, share
-        self._memory: PeerMemory | None = None
-        self._possible = True
-        self._room = 0
+        self._ranks, self._share, self._possible = ranks, share, True
+        self._passes: tuple[PeerMemory, PassMemory] | None = None  # of all processes, and this one's
+        self._slots = self._instances = 0  # there is room for
+        self._starts: list[int] = []  # of status, colors, radii and records in a process's memory, in numbers
+        self._model: PeerMemory | None = None
+        self._model_room = 0
         self._placed: Gaussians | None = None
         self._others: list[Gaussians] = []
 
@@ -232,16 +76,15 @@ class SharedModel:
             The model there; the given one, where there is no such memory.
         """
         starts = aligned_starts([value.numel() for _, value in gaussians.items()])
-        if self._possible and starts[-1] > self._room:
-            if self._memory is not None:
-                synchronize(gaussians.device)  # as in `InPlace`
-            self._placed, self._others, self._memory = None, [], None
-            self._room = with_room(starts[-1], LEAST)
-            self._memory = self._share(self._ranks, self._room, gaussians.device)
-            self._possible = self._memory is not None
-        if self._memory is None:
+        if starts[-1] > self._model_room:
+            if self._model is not None:
+                synchronize(gaussians.device)  # as in `prepare`
+            self._placed, self._others, self._model = None, [], None
+            self._model_room = with_room(starts[-1], LEAST)
+            self._model = self._take(self._model_room, gaussians.device)
+        if self._model is None:
             return gaussians
-        parts = self._memory.parts
+        parts = self._model.parts
         models = [_laid_out(gaussians, part, starts) for part in parts]
         own = models.pop(self._ranks.rank)
         # A model that lies in this memory already, of another size, may overlap its new place.
@@ -256,6 +99,97 @@ class SharedModel:
     def others(self, gaussians: Gaussians) -> list[Gaussians] | None:
         """The model in the memory of each other process; None where `gaussians` was not placed here."""
         return self._others if gaussians is self._placed else None
+
+    def prepare(self, engine: SharedEngine, shares: Sequence[Share], gaussians: int, device: torch.device) -> bool:
+        """Make room for a pass, which the engine keeps in this memory. Every process must call this.
+
+        Args:
+            gaussians: N.
+
+        Returns:
+            False: there is no such memory, for none of the processes, or engines do not keep passes there.
+        """
+        slots = max(share.num_slots for share in shares)
+        instances = max(len(share) for share in shares) * gaussians
+        if slots > self._slots or instances > self._instances:
+            # All processes come here in one iteration, as their shares are known to all. The old memory lives on until
+            # none has it mapped.
+            if self._passes is not None:
+                synchronize(device)  # unmapping waits for the device, with all threads of Python held up
+                engine.lend(None)
+                self._passes = None
+            if slots > self._slots:
+                self._slots = with_room(slots, LEAST // 8)
+            if instances > self._instances:
+                self._instances = with_room(instances, LEAST // (RECORD + RADII))
+            sizes = PassStatus.SIZE, 3 * self._slots, RADII * self._instances, RECORD * self._instances
+            self._starts = aligned_starts(sizes)
+            memory = self._take(self._starts[-1], device)
+            if memory is not None:
+                part = memory.parts[self._ranks.rank]
+                parts = [part[start : start + size] for start, size in zip(self._starts, sizes, strict=False)]
+                status, colors, radii, records = parts
+                self._passes = memory, PassMemory(status.view(torch.int32), colors, radii.view(torch.int32), records)
+        return self._passes is not None and engine.lend(self._passes[1])
+
+    def _take(self, size: int, device: torch.device) -> PeerMemory | None:
+        """Memory for so many numbers of every process, or None for good."""
+        memory = self._share(self._ranks, size, device) if self._possible else None
+        self._possible = memory is not None
+        return memory
+
+    def colors(self, engine: SharedEngine, shares: Sequence[Share], own: Tensor | None, seen: Tensor) -> Tensor:
+        """[P, 3] the colours of all samples.
+
+        Args:
+            own: [., 3] this process's, in the memory that its engine was lent; None if it has no samples.
+            seen: [2] int32, written: `SharedEngine.gather`.
+        """
+        assert self._passes is not None, "prepare says that there is no memory"
+        memory, lent = self._passes
+        if self._ranks.asked:
+            lent.stop.fill_(self._ranks.asked)
+        memory.barrier(WRITTEN)
+        return engine.gather(memory.parts, self._starts[1], [share.num_slots for share in shares], seen)
+
+    def collect(
+        self,
+        engine: SharedEngine,
+        shares: Sequence[Share],
+        rows: Sequence[slice],
+        own: ScreenRecords | None,
+        target: ScreenRecords,
+    ) -> None:
+        """Collect the records of all views for this process's rows.
+
+        Args:
+            rows: what each process collects; the last one ends with N, the number of Gaussians.
+            own: of this process's views and all Gaussians, in the memory that its engine was lent; None if it has no
+                views.
+            target: of all views and this process's rows; overwritten, but for records that are off screen.
+        """
+        assert self._passes is not None
+        memory, _ = self._passes
+        memory.barrier(DRAWN)
+        drawn = [(rank, share) for rank, share in enumerate(shares) if len(share)]
+        sources = [self._screen(memory.parts[rank], len(share), rows[-1].stop) for rank, share in drawn]
+        engine.collect(sources, [share.views.start for _, share in drawn], target, rows[self._ranks.rank].start)
+
+    def stepped(self, model: Gaussians | None = None) -> None:
+        """Put what this process enqueues next after the steps of all, and after all that the others read of it."""
+        assert self._passes is not None
+        self._passes[0].barrier(STEPPED)
+
+    def _screen(self, part: Tensor, views: int, gaussians: int) -> ScreenRecords:
+        """A process's records [V, N, .], laid out from the start of what its engine was lent."""
+        radii, records = (part.storage_offset() + start for start in self._starts[2:4])
+        shapes = [((views, gaussians, size), (gaussians * size, size, 1)) for size in (RECORD, RADII)]
+        # By as_strided, one operation: slicing takes the host as long as a launch does.
+        return ScreenRecords(
+            part.as_strided(*shapes[0], records),
+            part.as_strided(*shapes[1], radii).view(torch.int32),
+            with_statistics=False,
+        )
 
 
 def _laid_out(like: Gaussians, part: Tensor, starts: Sequence[int]) -> Gaussians:

@@ -9,10 +9,9 @@ from __future__ import annotations
 import ctypes
 import os
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,18 +36,17 @@ PROOF_MILLISECONDS = 60_000
 """Time without an answer from another GPU after which the first barrier ends the process. Later ones wait for ever, as
 the first process may evaluate for an hour; a process that is lost is noticed by its launcher."""
 
-
-LEAST, SMALL = 1 << 24, 1 << 26
-"""Least size of a memory that holds many numbers, 64 MiB; and the size below which it grows twofold, 256 MiB."""
+LEAST = 1 << 24
+"""Least size of a memory that holds many numbers, 64 MiB."""
 
 ALIGNMENT = 64
 """Alignment of what lies in a memory, in numbers of four bytes."""
 
 
-def with_room(numbers: int, least: int = 0) -> int:
-    """Size of a memory that must grow to `numbers`: twice as many while it is small, as all processes wait for
-    each other and their GPUs when it grows; else a quarter more. At least `least`."""
-    return max(least, 2 * numbers if numbers < SMALL else numbers + numbers // 4)
+def with_room(numbers: int, least: int) -> int:
+    """Size of a memory that must grow to `numbers`: half more, as all processes wait for each other and their GPUs when
+    it grows. At least `least`."""
+    return max(least, numbers + numbers // 2)
 
 
 def aligned_starts(sizes: Iterable[int]) -> list[int]:
@@ -63,13 +61,11 @@ class PeerMemory:
     Args:
         parts: [size] float32 of each process, rank after rank.
         barrier: called with a small number by every process: what its stream does next comes after all that the
-            streams of all did before their calls with this number. No host waits.
-        owner: keeps the memory mapped.
+            streams of all did before their calls with this number. No host waits. It keeps the memory mapped.
     """
 
     parts: list[Tensor]
     barrier: Callable[[int], None]
-    owner: Any = None
 
 
 Sharing = Callable[[ProcessRanks, int, torch.device], PeerMemory | None]
@@ -80,66 +76,53 @@ def share_memory(ranks: ProcessRanks, size: int, device: torch.device) -> PeerMe
     """Memory for `size` numbers of every process. Every process must call this, with one size.
 
     Returns:
-        Zeros; or None on all of them, if one cannot have it. It is not tried again then.
+        Zeros; or None on all of them, if one cannot have it.
     """
-    if not ranks.reads_peers or device.type != "cuda":
+    if device.type != "cuda":
         return None
     for name, value in SETTINGS.items():
         os.environ.setdefault(name, value)
-    memory: PeerMemory | None = None
-    # Step by step, so that none waits in one for a process that failed in the step before.
-    for step in (_allocate, _map, _prove):
+    steps, memory = _steps(ranks, size), None
+    for _ in range(3):  # step by step, so that none waits in one for a process that failed in the step before
         try:
-            memory = step(ranks, size, memory)
+            memory = next(steps, None)
         except Exception as error:  # of drivers and versions of torch, whatever they raise
             memory, reason = None, f"{type(error).__name__}: {error}".splitlines()[0]
             warnings.warn(f"GPUs do not read each other's memory, and send messages ({reason})", stacklevel=2)
         if not all(done for (done,) in ranks.gather_numbers([int(memory is not None)])):
-            ranks.reads_peers = False
             return None
     return memory
 
 
-def _allocate(ranks: ProcessRanks, size: int, nothing: PeerMemory | None) -> PeerMemory | None:
-    """Allocate this process's part."""
+def _steps(ranks: ProcessRanks, size: int) -> Iterator[PeerMemory]:
+    """Allocate this process's part; map all parts; prove that GPUs meet at a barrier in them.
+
+    It ends early where this process cannot have such memory.
+    """
     import torch.distributed._symmetric_memory as symmetric
 
     one_host = os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE")
     if not one_host or ranks.count > MAX_PEERS or os.environ.get(MESSAGES_VARIABLE) == "messages" or not _linked():
-        return None
+        return
     # As `symmetric.empty` does, but never from a pool: what one process has kept from earlier runs there, another may
     # not, and only one of the two would then wait for the other.
     device = torch.device("cuda", torch.cuda.current_device())
     if torch.cuda.mem_get_info(device)[0] < 8 * size:  # the driver gives this memory, without what torch keeps
         torch.cuda.empty_cache()
     own = symmetric._SymmetricMemory.empty_strided_p2p((size,), (1,), torch.float32, device)
-    return PeerMemory([own.zero_()], lambda channel: None)
-
-
-def _map(ranks: ProcessRanks, size: int, allocated: PeerMemory | None) -> PeerMemory | None:
-    """Map all parts."""
-    import torch.distributed._symmetric_memory as symmetric
+    yield PeerMemory([own.zero_()], lambda channel: None)
 
     group = torch.distributed.group.WORLD
-    if allocated is None or group is None:
-        return None
-    (own,) = allocated.parts
+    assert group is not None
     handle = symmetric.rendezvous(own, group)
     parts = [handle.get_buffer(rank, (size,), torch.float32) for rank in range(ranks.count)]
     parts[ranks.rank] = own
-    return PeerMemory(parts, handle.barrier, handle)
+    memory = PeerMemory(parts, handle.barrier)
+    yield memory
 
-
-def _prove(ranks: ProcessRanks, size: int, memory: PeerMemory | None) -> PeerMemory | None:
-    """Return `memory` if every process reads what the others write, else None."""
-    if memory is None:
-        return None
-    memory.parts[ranks.rank][:1] = ranks.rank + 1.0
-    memory.owner.barrier(channel=0, timeout_ms=PROOF_MILLISECONDS)
-    found = torch.cat([part[:1] for part in memory.parts]).tolist()
-    memory.barrier(0)  # all have read
-    memory.parts[ranks.rank][:1] = 0.0
-    return memory if found == [rank + 1.0 for rank in range(ranks.count)] else None
+    handle.barrier(channel=0, timeout_ms=PROOF_MILLISECONDS)
+    torch.cuda.synchronize(device)
+    yield memory
 
 
 def _linked() -> bool:

@@ -1,9 +1,9 @@
 """Starting the processes of a training, joining them, and ending all of them when one is lost.
 
 torchrun, or `start` here by the same means, starts a process for each GPU and watches them: when one ends with an
-error, it ends the others, and starts all again if asked to (`--max-restarts`). A process that waits for a lost one
-inside a collective cannot be told so by Python; `_Watch` ends it. Where the launcher itself is lost, the kernel ends
-all (`end_with_parent`).
+error, it ends the others, and starts all again if asked to (`--max-restarts`). A process that waits for a lost one on
+its GPU cannot be told so by Python; the launcher kills it after 30 seconds. Where the launcher itself is lost, the
+kernel ends all (`end_with_parent`).
 """
 
 from __future__ import annotations
@@ -11,12 +11,8 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
-import re
 import signal
-import socket
 import sys
-import threading
-import time
 import traceback
 import uuid
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +22,7 @@ from datetime import timedelta
 import torch
 
 from turbogs_plugin.device import processor_cores
-from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, RankLost, Ranks
+from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, Ranks
 from turbogs_plugin.errors import InputError, TrainingStopped, error_line
 
 TIMEOUT = timedelta(hours=6)
@@ -35,9 +31,6 @@ that ends is noticed at once."""
 
 MEETING = timedelta(minutes=5)
 """The longest that processes wait for others to be started."""
-
-GRACE_SECONDS = 15.0
-"""A process that was asked to end and makes no iteration for so long is ended: another one is lost."""
 
 RUN_ID = "TORCHELASTIC_RUN_ID"
 """The variable that a launcher gives each of its processes, and none has without one, as under Slurm."""
@@ -76,25 +69,21 @@ def start(count: int, arguments: Sequence[str], device: str = "auto", module: st
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
     present = torch.cuda.device_count()
-    if device != "cpu" and present < count and (present or device == "cuda"):
+    if device != "cpu" and present < count:
         raise InputError(f"--gpus {count}: {present} GPUs answer here; ask for as many, or see 'turbogs doctor'")
-    if device == "auto" and not present:
-        raise InputError(f"--gpus {count}: no GPU answers here; leave it out, or see 'turbogs doctor'")
     logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)  # the processes say what happened
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, processor_cores() // count)))
     config = LaunchConfig(
         min_nodes=1,
         max_nodes=1,
         nproc_per_node=count,
-        run_id=f"turbogs-{os.getpid()}-{uuid.uuid4().hex}",  # see `_end_with_launcher`
+        run_id=uuid.uuid4().hex,
         rdzv_backend="c10d",
         rdzv_endpoint="localhost:0",
         max_restarts=0,
         monitor_interval=0.1,
         local_addr="localhost",
     )
-    asked = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
-    before = {number: signal.getsignal(number) for number in asked}  # the launcher sets its own, and leaves them
     try:
         elastic_launch(config, sys.executable)("-m", module, *arguments)
     except ChildFailedError as error:
@@ -107,9 +96,6 @@ def start(count: int, arguments: Sequence[str], device: str = "auto", module: st
         return failure.exitcode if failure.exitcode > 0 else 1
     except SignalException as stopped:
         return 128 + stopped.sigval
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     return 0
 
 
@@ -126,7 +112,8 @@ def joined(device: str) -> Iterator[Ranks]:
     Raises:
         InputError: there are fewer GPUs than processes on this machine, or the processes do not find each other.
     """
-    _end_with_launcher()
+    if RUN_ID in os.environ:  # without a launcher, the parent, a shell say, may go before its time
+        end_with_parent()
     if not launched():
         yield ONE
         return
@@ -138,8 +125,6 @@ def joined(device: str) -> Iterator[Ranks]:
         os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # on one machine, whatever its name resolves to
     try:
         store, rank, count = next(distributed.rendezvous("env://", timeout=MEETING))
-        # Processes that are started again may find the store as the earlier ones left it.
-        store = distributed.PrefixStore(f"turbogs-{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
         distributed.init_process_group(
             "cpu:gloo,cuda:nccl" if on_gpu else "gloo", store=store, rank=rank, world_size=count, timeout=TIMEOUT
         )
@@ -152,11 +137,8 @@ def joined(device: str) -> Iterator[Ranks]:
         except RuntimeError:  # whoever keeps the store is gone
             return True
 
-    ranks = ProcessRanks(gpu)
-    watch = _Watch(ranks, speaks)
     try:
-        yield ranks
-        watch.end()
+        yield ProcessRanks(gpu)
         with suppress(RuntimeError):  # all is done, whoever has gone already
             distributed.destroy_process_group()
     except (InputError, TrainingStopped, OSError) as error:
@@ -172,36 +154,25 @@ def joined(device: str) -> Iterator[Ranks]:
         os._exit(1)
 
 
-def end_with_parent(alive: Callable[[], bool]) -> None:
+def end_with_parent(alive: Callable[[], bool] = lambda: True) -> None:
     """From now on this process is killed when its parent is gone, however that went. Linux only.
 
-    The kernel does it, so it works where the main thread waits for a GPU or for another process, and holds Python's
-    lock. The signal is SIGKILL. SIGTERM would mean to save first: that waits for processes which may be gone, holds the
-    GPU meanwhile, and writes into a folder that its user may have started on anew. Nothing is lost but the iterations
-    since the last checkpoint: files are written beside their place and renamed.
+    The kernel does it, so it works where the main thread waits for a GPU or for another process. The signal is SIGKILL,
+    as SIGTERM would mean to save first, and that waits for processes which may be gone. Nothing is lost but the
+    iterations since the last checkpoint: files are written beside their place and renamed.
 
     To be called in a thread that stays, as the kernel keeps the wish with the thread. It also takes the end of the
-    *thread* that started this process for the parent's; torchrun, `start` and a study wait there for their processes.
+    *thread* that started this process for the parent's; launchers wait there for their processes.
 
     Args:
-        alive: whether the parent was still there after the wish. It may have gone before.
+        alive: whether the parent was still there after the wish, where its child can tell. Processes of a launcher
+            that was lost before do not meet, as it kept their store, and end with a line after `MEETING`.
     """
     if sys.platform != "linux":
         return
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, *(ctypes.c_ulong(value) for value in (signal.SIGKILL, 0, 0, 0)))
     if not alive():
         os.kill(os.getpid(), signal.SIGKILL)
-
-
-def _end_with_launcher() -> None:
-    """Under torchrun or `start`. Without one nothing is done: the parent, a shell say, may go before its time.
-
-    The run's id of `start` tells who its launcher is, should it have gone in the seconds before this call. Where
-    torchrun has, its processes wait for `MEETING` without a GPU, as it kept the store, and end with a line.
-    """
-    if RUN_ID in os.environ:
-        own = re.match(r"turbogs-(\d+)-", os.environ[RUN_ID])
-        end_with_parent(lambda: own is None or os.getppid() == int(own[1]))
 
 
 def _see_own_gpu() -> int:
@@ -211,8 +182,8 @@ def _see_own_gpu() -> int:
         Its number among those that the process still sees.
     """
     place, count = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
-    names = [name for name in visible.split(",") if name] or [str(gpu) for gpu in range(torch.cuda.device_count())]
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(torch.cuda.device_count())))
+    names = visible.strip(",").split(",")
     if len(names) < count:
         raise InputError(f"{count} processes need as many GPUs on this machine, {len(names)} answer: start fewer")
     os.environ["CUDA_VISIBLE_DEVICES"] = names[place]
@@ -220,40 +191,3 @@ def _see_own_gpu() -> int:
         return 0
     torch.cuda.set_device(place)  # the driver had counted them already
     return place
-
-
-class _Watch:
-    """Ends this process `GRACE_SECONDS` after a SIGTERM or SIGINT if it makes no iteration.
-
-    Python's handlers run between two instructions of the main thread, so never while that waits in a collective for a
-    process that is gone. The number of a signal is also written to a socket, from which a thread reads here.
-    """
-
-    def __init__(self, ranks: ProcessRanks, speaks: Callable[[], bool]) -> None:
-        self._ranks, self._speaks = ranks, speaks
-        self._read, self._written = socket.socketpair()
-        self._written.setblocking(False)
-        self._main = threading.current_thread() is threading.main_thread()  # signals come to it alone
-        if self._main:
-            self._before = signal.set_wakeup_fd(self._written.fileno(), warn_on_full_buffer=False)
-        threading.Thread(target=self._wait, daemon=True).start()
-
-    def end(self) -> None:
-        if self._main:
-            signal.set_wakeup_fd(self._before)
-        self._written.close()
-
-    def _wait(self) -> None:
-        number = 0
-        with self._read:
-            while number not in (signal.SIGTERM, signal.SIGINT):
-                message = self._read.recv(1)
-                if not message:
-                    return
-                number = message[0]
-        while time.monotonic() - self._ranks.latest < GRACE_SECONDS:
-            time.sleep(0.2)
-        if self._speaks():
-            lost = RankLost("another process of this training does not answer: go on from the last checkpoint")
-            print(error_line(lost), file=sys.stderr, flush=True)
-        os._exit(128 + number)

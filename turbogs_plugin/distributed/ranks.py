@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import functools
 import re
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -17,12 +15,13 @@ from torch import Tensor
 
 from turbogs_plugin.engine import Engine, engine_of
 from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.model.torch_file import leaves
+from turbogs_plugin.types import RowUpdate
 
 Value = TypeVar("Value")
 
-
-class RankLost(TrainingStopped):
-    """Another process of the training ended or does not answer."""
+CHUNK = 1 << 22
+"""Elements that are compared at a time, to bound the memory of the comparison."""
 
 
 class Ranks:
@@ -57,16 +56,7 @@ class Ranks:
 
     def meet(self, device: torch.device) -> None:
         """Connect the processes' GPUs, so that no exchange waits for it: NCCL takes up to half a second. Every process
-        must call this, and waits for the others. Another thread may exchange what lies on the host meanwhile.
-
-        Args:
-            device: of the training; where it is a CPU, nothing is left to connect.
-        """
-
-    @contextmanager
-    def working(self) -> Iterator[None]:
-        """While entered, this process does something long that no iteration shows, such as writing a checkpoint."""
-        yield
+        must call this, and waits for the others. Another thread may exchange what lies on the host meanwhile."""
 
 
 ONE = Ranks()
@@ -74,7 +64,7 @@ ONE = Ranks()
 
 
 def _answered(method: Callable[..., Value]) -> Callable[..., Value]:
-    """Raise `RankLost` where another process does not answer."""
+    """Raise `TrainingStopped` where another process does not answer."""
 
     @functools.wraps(method)
     def answered(self: ProcessRanks, *arguments: Any, **options: Any) -> Value:
@@ -83,9 +73,8 @@ def _answered(method: Callable[..., Value]) -> Callable[..., Value]:
         except torch.cuda.OutOfMemoryError:
             raise
         except RuntimeError as error:  # gloo's and NCCL's errors are of this kind
-            text = re.sub(r"\[/[^]]*\] *", "", str(error)).strip()  # without places in torch's sources
-            reason = re.split(r"\. |\n", text)[0][:200] or type(error).__name__
-            raise RankLost(f"another process of this training ended or does not answer ({reason})") from error
+            reason = re.split(r"\. |\n", str(error))[0][:200]
+            raise TrainingStopped(f"another process of this training ended or does not answer ({reason})") from error
 
     return answered
 
@@ -100,20 +89,14 @@ class ProcessRanks(Ranks):
 
     Attributes:
         asked: number of the signal by which this process wants all to stop; 0: none.
-        latest: `time.monotonic` of the latest sign of progress; infinite while `working`.
-        reads_peers: all processes may use each other's memory in place, as far as they have tried.
     """
 
     def __init__(self, gpu: int = 0) -> None:
         import torch.distributed as distributed
 
         self._distributed, self._gpu = distributed, gpu
-        # Newer versions of torch have another name for it, and warn of the old one.
-        self._all_gather = getattr(distributed, "all_gather_single", None) or distributed.all_gather_into_tensor
         self.rank, self.count = distributed.get_rank(), distributed.get_world_size()
         self.stop_signal = self.asked = 0
-        self.latest = time.monotonic()
-        self.reads_peers = True
 
     @_answered
     def agree(self, value: Value) -> Value:
@@ -135,26 +118,23 @@ class ProcessRanks(Ranks):
         self._distributed.broadcast(tensor, src=source)
 
     @_answered
-    def gather(self, tensor: Tensor, gathered: Tensor | None = None) -> Tensor:
-        """[count, ...]: the tensors of all processes, of one shape, rank after rank. `gathered`: to be overwritten."""
-        if gathered is None:
-            gathered = tensor.new_empty(self.count, *tensor.shape)
-        self._all_gather(gathered.flatten(0, 1), tensor)
-        return gathered
-
-    @_answered
-    def send_and_receive(self, sent: list[tuple[int, Tensor]], received: list[tuple[int, Tensor]]) -> None:
-        """Send tensors to other processes and receive theirs, at once. What two send each other is in one order.
+    def exchange(self, sent: Sequence[Tensor], sizes: Sequence[int]) -> list[Tensor]:
+        """Send a flat float32 tensor to each process, this one included, and receive one from each.
 
         Args:
-            sent: (rank, contiguous tensor) each; empty ones are left out.
-            received: (rank, contiguous tensor to overwrite) each.
+            sent: rank after rank, of any sizes.
+            sizes: of what each process sends to this one.
+
+        Returns:
+            Flat float32 tensors of these sizes, rank after rank, equal to the bit to what was sent.
         """
-        distributed = self._distributed
-        given = [(distributed.isend, *each) for each in sent] + [(distributed.irecv, *each) for each in received]
-        operations = [distributed.P2POp(act, tensor, rank) for act, rank, tensor in given if tensor.numel()]
-        for work in distributed.batch_isend_irecv(operations) if operations else ():
-            work.wait()
+        received = sent[0].new_empty(sum(sizes))
+        self._distributed.all_to_all_single(received, torch.cat(list(sent)), list(sizes), [len(part) for part in sent])
+        return list(received.split(list(sizes)))
+
+    def to_all(self, own: Tensor, sizes: Sequence[int]) -> list[Tensor]:
+        """`exchange` where a process sends one tensor to all."""
+        return self.exchange([own] * self.count, sizes)
 
     def ask_to_stop(self, signal: int) -> bool:
         self.asked = signal
@@ -171,8 +151,54 @@ class ProcessRanks(Ranks):
             torch.cuda.set_device(self._gpu)  # every thread has a current one
             self.broadcast(torch.zeros(1, device=device))
 
-    @contextmanager
-    def working(self) -> Iterator[None]:
-        self.latest = float("inf")
-        yield
-        self.latest = time.monotonic()
+
+def require_equal(ranks: ProcessRanks, state: dict[str, Any]) -> None:
+    """Compare a state with the first process's, to the bit. Every process must call this.
+
+    Args:
+        state: nested dicts of tensors and numbers; ``iteration`` is among them.
+
+    Raises:
+        TrainingStopped: on all processes, where a tensor or a number of one differs.
+    """
+    values = {name: value for name, value in leaves(state, "state") if isinstance(value, Tensor | int | float)}
+    equal = [_is_the_first_ones(ranks, value) for value in values.values()]
+    for rank, found in enumerate(ranks.gather_numbers([int(each) for each in equal])):
+        if 0 in found:
+            raise TrainingStopped(
+                f"iteration {state['iteration']}: {list(values)[found.index(0)]} of rank {rank} differs from that of "
+                "rank 0, though all make the same steps; do the GPUs and their software differ, or is one broken?"
+            )
+
+
+def _is_the_first_ones(ranks: ProcessRanks, value: Tensor | int | float) -> bool:
+    """Whether a tensor, or a number, is equal to the first process's; its size is."""
+    equal, flat = (
+        True,
+        value.detach().flatten() if isinstance(value, Tensor) else torch.tensor([value], dtype=torch.float64),
+    )
+    for part in flat.split(CHUNK):
+        own = part.new_empty(len(part)).copy_(part).view(torch.uint8)  # a stride of 1, even of one element
+        first = own.clone()
+        ranks.broadcast(first)
+        equal = equal and torch.equal(first, own)
+    return equal
+
+
+def first_change(ranks: ProcessRanks, update: RowUpdate | None, device: torch.device) -> RowUpdate | None:
+    """The first process's change of the set of Gaussians, on all."""
+    tensors, plain = {}, None
+    if update is not None:
+        tensors = {"source": update.source, "fresh": update.fresh.to(torch.uint8), **update.values}
+        places = {name: (value.shape, value.dtype) for name, value in tensors.items()}
+        plain = places, update.reset, (update.num_cloned, update.num_split, update.num_pruned)
+    plain = ranks.agree(plain)
+    if plain is None:
+        return None
+    places, reset, counts = plain
+    for name, (shape, dtype) in places.items():
+        own = tensors[name].contiguous() if ranks.first else torch.empty(shape, dtype=dtype, device=device)
+        ranks.broadcast(own)
+        tensors[name] = own
+    values = {name: tensors[name] for name in places if name not in ("source", "fresh")}
+    return RowUpdate(tensors["source"], tensors["fresh"].bool(), values, reset, *counts)

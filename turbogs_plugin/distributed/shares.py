@@ -25,19 +25,13 @@ class Share:
 
     Args:
         tiles, slots: of the samples.
-        views: positions in the batch of the views that the tiles lie in.
-        continues: the first of these views began in an earlier share.
+        views: positions in the batch of the views that the tiles lie in; the first one may have begun in an earlier
+            share.
     """
 
     tiles: slice
     slots: slice
     views: slice
-    continues: bool
-
-    @property
-    def begun(self) -> slice:
-        """The views that begin in this share."""
-        return slice(self.views.start + self.continues, self.views.stop)
 
     @property
     def num_slots(self) -> int:
@@ -81,7 +75,6 @@ def _cut(view_ends: np.ndarray, slot_ends: np.ndarray, count: int) -> list[Share
             start, stop = np.searchsorted(views, first, side="right") - 1, np.searchsorted(views, end, side="left")
             # Views without samples have records, too: those before the first tile, and behind the last one.
             seen = slice(min(int(start), begun), len(view_ends) if end == cuts[-1] else int(stop))
-        places = slice(int(slots[first]), int(slots[end]))
-        shares.append(Share(slice(first, end), places, seen, seen.start < begun))
+        shares.append(Share(slice(first, end), slice(int(slots[first]), int(slots[end])), seen))
         begun = max(begun, seen.stop)
     return shares

@@ -95,8 +95,9 @@ class BaseEngine(SharedEngine):
     def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
         collect_records(sources, views, target, row)
 
-    def lend(self, memory: PassMemory | None) -> None:
+    def lend(self, memory: PassMemory | None) -> bool:
         """No memory is kept from pass to pass here."""
+        return False
 
     def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
         colors = gather_colors(parts, first, counts, seen)

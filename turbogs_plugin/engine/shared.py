@@ -106,9 +106,12 @@ class SharedEngine(Engine, Protocol):
             row: first of the M among the N.
         """
 
-    def lend(self, memory: PassMemory | None) -> None:
-        """Let the following passes keep in this memory what it is for, if the engine keeps memory from pass to pass,
-        and as far as it fits in. None: in the engine's own."""
+    def lend(self, memory: PassMemory | None) -> bool:
+        """Let the following passes keep in this memory what it is for, as far as it fits in. None: in the engine's own.
+
+        Returns:
+            Whether they do. False for an engine that keeps no memory from pass to pass.
+        """
 
     def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
         """Put the colours of all processes together. If one has set `PassStatus.OVERFLOW`, so does `overflow` here.

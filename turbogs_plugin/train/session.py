@@ -209,8 +209,7 @@ class RunSession(Listener):
             if self.loop.finished:
                 self._checkpoint = self._in_thread(save_checkpoint, *arguments)
             else:
-                with self.loop.ranks.working():
-                    save_checkpoint(*arguments)
+                save_checkpoint(*arguments)
         self._saved_at = self.trainer.iteration
 
     def _in_thread(self, write: Callable[..., object], *arguments: object) -> Future[float]:

@@ -66,9 +66,10 @@ class CudaEngine(BaseEngine):
         padded = launches.Sources(*arrays, *(None,) * (2 * layout.MAX_PEERS - len(arrays)))
         library.launch(launches.CollectRecords(target.records, target.radii, padded, list(views), row))
 
-    def lend(self, memory: PassMemory | None) -> None:
+    def lend(self, memory: PassMemory | None) -> bool:
         if self.workspace is not None:
             self.workspace.lend(memory)
+        return self.workspace is not None
 
     def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
         def arguments(buffers: Buffers, *_: int) -> launches.GatherColors:
