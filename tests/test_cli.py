@@ -282,7 +282,7 @@ def test_a_finished_run_is_evaluated_rendered_and_exported(turbogs, finished, tm
 
 
 def test_depth_images_are_in_the_captures_own_units(turbogs, capture, finished):
-    """As the exported model and the capture's own cameras, which are in these units, give them."""
+    """The exported model and the capture's own cameras, which are in these units, give equal depths."""
     code, out, _ = turbogs("render", finished, "--depth", "--device", "cpu")
     folder = finished / "renders" / "test-depth"
     assert code == 0 and str(folder) in out

@@ -10,7 +10,7 @@ from PIL import Image
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.kinds import holds_photos_alone
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.reconstruct.photos import list_photos
+from turbogs_plugin.reconstruct.photos import read_photos
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_a_run_is_no_folder_of_photos(tmp_path, part):
     said = f"{run} is a run's folder, not a capture: give /data/cup, which it was trained on"
     assert refusal(run) == said
     with pytest.raises(InputError) as refused:
-        list_photos(run)
+        read_photos(run)
     assert str(refused.value) == said
     (run / "config.yaml").write_text("scene: cup\n")  # another program's
     assert holds_photos_alone(run)
