@@ -16,7 +16,6 @@ from PIL import Image
 
 from turbogs_plugin import __version__, captures, cli
 from turbogs_plugin.commands import COMMANDS
-from turbogs_plugin.commands.parsing import parsed
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.renders import distinct_stems
@@ -87,10 +86,6 @@ def test_a_broken_capture_is_refused(turbogs, copy, tmp_path):
 def test_a_bad_setting_is_refused(turbogs, capture, tmp_path, arguments, words):
     assert_refused(turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *arguments), *words)
     assert not (tmp_path / "run").exists()
-
-
-def test_no_such_scene(turbogs, tmp_path):
-    assert_refused(turbogs("train", tmp_path / "absent", "--out", tmp_path / "run"), "no such scene", "absent")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
@@ -303,13 +298,6 @@ def test_version(turbogs):
     assert turbogs("--version") == (0, f"turbogs {__version__}\n", "")
 
 
-def test_doctor(turbogs):
-    code, out, _ = turbogs("doctor")
-    assert code == 0
-    for word in ("torch", "gsplat", "Python", "kernels", "nvcc"):
-        assert word in out
-
-
 def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypatch):
     stop_after(monkeypatch, 3)
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *TINY)
@@ -383,17 +371,3 @@ def test_every_command_has_help(turbogs, verb):
     assert code == 0 and f"usage: turbogs {verb}" in out and err == ""
     code, out, err = turbogs()
     assert code == 0 and f"\n  {verb} " in out and err == ""
-
-
-def test_what_is_called_is_called_afterwards(capsys):
-    """A command's own words, and its own end, are no refusal."""
-
-    def command(number: int) -> int:
-        print(number, file=sys.stderr)
-        sys.exit(2)
-
-    call = parsed({"one": command}, ["one", "--number", "3"])
-    assert capsys.readouterr().err == ""
-    with pytest.raises(SystemExit):
-        call()
-    assert capsys.readouterr().err == "3\n"

@@ -1,6 +1,7 @@
 """From photos to cameras, on rendered photos whose cameras are known; what is said of those that cannot be solved."""
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -361,33 +362,20 @@ def test_a_reconstruction_in_parts_is_not_taken_for_photos_alone(solved, tmp_pat
     assert holds_photos_alone(solved[0].parent) and not holds_photos_alone(tmp_path)
 
 
-def test_a_model_that_a_full_disk_cut_is_no_solution(solved, tmp_path):
-    model = pycolmap.Reconstruction(solved[1].scene / "sparse/0")
+def test_a_scene_is_made_once_by_two_calls(solved, tmp_path, monkeypatch):
+    photos, scene, waiting = solved[0], tmp_path / "scene", []
 
-    class Cut:
-        def num_points3D(self) -> int:
-            return model.num_points3D()
+    def make(*arguments) -> Solution:
+        waiting.append(pool.submit(reconstruct, photos, scene))
+        shutil.copytree(solved[1].scene / "sparse", scene / "sparse")
+        shutil.copy(solved[1].scene / "reconstruction/solution.json", scene / "reconstruction")
+        return solved[1]
 
-        def write_binary(self, folder: Path) -> None:
-            model.write_binary(folder)
-            with open(folder / "images.bin", "r+b") as file:
-                file.truncate(100)
-
-    with pytest.raises(OSError, match="cannot be written whole"):
-        run._write_model(Cut(), tmp_path / "sparse", tmp_path / "scratch")
-    assert not (tmp_path / "sparse").exists()
-
-
-def test_a_scene_is_made_by_one_process(solved, tmp_path, monkeypatch):
-    photos, scene = solved[0], tmp_path / "scene"
-
-    def meanwhile(*arguments) -> str:
-        with pytest.raises(InputError, match="scene' is being made by another process: wait for it"):
-            reconstruct(photos, scene)
-        return "made"
-
-    monkeypatch.setattr(run, "_reconstruct", meanwhile)
-    assert reconstruct(photos, scene) == "made"
+    monkeypatch.setattr(run, "_reconstruct", make)
+    with ThreadPoolExecutor() as pool:
+        assert reconstruct(photos, scene) == solved[1]
+    (second,) = waiting
+    assert second.result().registered == COUNT
 
 
 @pytest.mark.parametrize(("out", "words"), [("a file", "holds something else"), ("a file/scene", "not a folder")])

@@ -264,7 +264,7 @@ def test_the_digest_of_a_capture_is_of_names_and_sizes(capture):
 def test_a_cell_has_the_planned_length_and_keeps_a_cap_on_gaussians(tmp_path, monkeypatch):
     scene = load_scene(tiny_capture(tmp_path))
     monkeypatch.setitem(RULES, "train.iterations", lambda facts, config: Verdict(6, "few"))
-    capped = ["train.iterations=auto", "train.base_iterations=14", "density.max_gaussians=90"]
+    capped = ["train.iterations=auto", "density.max_gaussians=90"]
     result = train_cell("x", load_config("turbogs", [*TINY, *capped]), scene, torch.device("cpu"), provenance("cpu"))
     assert result.final["iteration"] == 6 == result.planned["train.iterations"]
     assert max(result.curve["gaussians"]) <= 90 and result.settings["train.iterations"] == "auto"
@@ -284,7 +284,7 @@ def test_a_limit_of_memory_which_is_of_a_process_is_refused():
         ("ablate components --scene absent --out X", ["no such scene"]),
         ("ablate components --scene CAPTURE --out X --only +geo", ["+geo-vs"]),
         ("ablate components --scene CAPTURE --out X --seeds 1 1", ["seeds"]),
-        ("ablate components --scene CAPTURE --scene CAPTURE --out X", ["two folders are called"]),
+        ("ablate components --scene CAPTURE --scene CAPTURE --out X", ["are called the same"]),
         ("ablate components --scene CAPTURE --out X --gpus 0", ["--gpus 0"]),
         ("ablate components budget.time=1s --scene CAPTURE --out X --steps 4", ["time budget 1s exclude each other"]),
         ("ablate components --scene CAPTURE --out CAPTURE", ["not empty"]),
