@@ -16,7 +16,6 @@ from PIL import Image
 
 from turbogs_plugin import __version__, captures, cli
 from turbogs_plugin.commands import COMMANDS
-from turbogs_plugin.commands.parsing import parsed
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.renders import distinct_stems
@@ -60,37 +59,16 @@ def tree(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def without_model(capture: Path) -> None:
-    (capture / "sparse/0/images.bin").unlink()
-
-
-def truncated_photo(capture: Path) -> None:
-    path = sorted((capture / "images").iterdir())[1]
-    path.write_bytes(path.read_bytes()[:-200])
-
-
-def photo_of_another_size(capture: Path) -> None:
-    path = sorted((capture / "images").iterdir())[1]
-    Image.fromarray(np.zeros((20, 20, 3), dtype=np.uint8)).save(path)
-
-
-BROKEN = [
-    (without_model, ["copy", "sparse/0 has no images", "bring that file"]),
-    (truncated_photo, ["view_001.png"]),
-    (photo_of_another_size, ["view_001.png", "20x20", "48x40"]),
-]
-
-
 def test_photos_of_more_pixels_than_pillow_takes_for_harmless(turbogs, capture, monkeypatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
     code, out, _ = turbogs("plan", capture, "--device", "cpu")
-    assert code == 0 and "views of 48x40 pixels" in out
+    assert code == 0 and "48x40 pixels" in out
 
 
-@pytest.mark.parametrize(("damage", "words"), BROKEN, ids=[damage.__name__ for damage, _ in BROKEN])
-def test_a_broken_capture_is_refused(turbogs, copy, tmp_path, damage, words):
-    damage(copy)
-    assert_refused(turbogs("train", copy, "--out", tmp_path / "run", "--device", "cpu", *QUICK), *words)
+def test_a_broken_capture_is_refused(turbogs, copy, tmp_path):
+    path = sorted((copy / "images").iterdir())[1]
+    path.write_bytes(path.read_bytes()[:-200])
+    assert_refused(turbogs("train", copy, "--out", tmp_path / "run", "--device", "cpu", *QUICK), "view_001.png")
     assert not (tmp_path / "run").exists()
 
 
@@ -100,24 +78,14 @@ def test_a_broken_capture_is_refused(turbogs, copy, tmp_path, damage, words):
         (["--max-gaussians", "0"], ["--max-gaussians 0", "at least 1"]),
         (["--config", "turbo"], ["'turbo'", "turbogs-big", "did you mean 'turbogs'"]),
         (["schedule.min_views=9", "schedule.max_views=4"], ["max_views", "9", "4"]),
-        (["train.iteration=1"], ["did you mean 'iterations'"]),
-        (["nonsense"], ["section.key=value"]),
         (["--factor", "0"], ["factor = 0 is not valid: it must be at least 1"]),
-        (["--max-memory", ""], ["--max-memory ''", "leave it out"]),
-        (["scene.path=elsewhere"], ["scene.path", "leave the override out"]),
-        (["--time-budget", "nonsense"], ["error: budget: 'nonsense' is no amount of time: write 20s"]),
-        (["train.iterations=abc"], ["train.iterations: expected a whole number or auto, got 'abc'"]),
-        (["train.iterations=["], ["override 'train.iterations=[' is not valid YAML"]),
+        (["--max-memory", ""], ["'' has no value", "leave it out"]),
         (["train.iterations=2", "--time-budget", "9s"], ["train.iterations=2 and the time budget 9s exclude"]),
     ],
 )
 def test_a_bad_setting_is_refused(turbogs, capture, tmp_path, arguments, words):
     assert_refused(turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *arguments), *words)
     assert not (tmp_path / "run").exists()
-
-
-def test_no_such_scene(turbogs, tmp_path):
-    assert_refused(turbogs("train", tmp_path / "absent", "--out", tmp_path / "run"), "no such scene", "absent")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
@@ -139,11 +107,6 @@ def test_a_command_to_go_on_is_right_for_folders_with_spaces(turbogs, capture, t
     run.mkdir()
     (run / "config.yaml").touch()
     assert_refused(turbogs("train", capture, "--out", run, "--device", "cpu", *QUICK), f"--resume '{run}'")
-
-
-def test_a_name_that_is_not_utf_8_is_refused_before_anything_is_computed(turbogs, capture, tmp_path):
-    said = r"'l\udcfct' is not UTF-8, in which reports and configurations are written: rename it"
-    assert_refused(turbogs("train", capture, "--out", "l\udcfct", *QUICK), said)
 
 
 def test_an_output_folder_with_other_files_is_left_alone(turbogs, capture, tmp_path):
@@ -168,8 +131,6 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
     ("error", "remedy"),
     [
         (OSError(28, "No space left on device"), "error: the system says: No space left on device; choose another"),
-        (FileNotFoundError(2, "No such file or directory", "/place"), "; see that its folder is there, or choose"),
-        (OSError(5, "Input/output error", "/place"), "; choose another place\n"),
     ],
 )
 def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch, error, remedy):
@@ -215,26 +176,17 @@ def test_plan_without_a_capture_lists_the_settings(turbogs, monkeypatch, changes
 def test_incomplete_and_contradictory_calls(turbogs, capture, tmp_path):
     assert_refused(turbogs("train"), "SCENE")
     assert_refused(turbogs("train", capture), "--out")
-    change = "train.iterations=2"
-    for call in (["train", "--out", tmp_path / "run", change], ["train", change, "--out", tmp_path / "run"]):
-        assert_refused(turbogs(*call), f"train needs a SCENE: '{change}' is a change of a setting")
-    assert_refused(turbogs("plan", change), "plan needs a SCENE")
-    assert not list(tmp_path.iterdir())
+    assert_refused(turbogs("train", "train.iterations=2", "--out", tmp_path / "run"), "no such scene")
     assert_refused(turbogs("train", capture, "--resume", tmp_path), "nothing else")
     assert_refused(turbogs("train", "--resume", tmp_path, "--device", "cpu"), "nothing else")
+    assert not list(tmp_path.iterdir())
 
 
-def test_an_empty_path_is_not_the_current_folder(turbogs, copy, tmp_path, monkeypatch):
+@pytest.mark.parametrize("words", [["eval", ""], ["train", "SCENE", "--out", ""], ["train", "SCENE", "--out="]])
+def test_an_empty_path_is_not_the_current_folder(turbogs, copy, tmp_path, monkeypatch, words):
     monkeypatch.chdir(copy)
     before = tree(tmp_path)
-    said = "an argument is '': write a value, as . for the current folder, or leave it out"
-    assert_refused(turbogs("train", "", "--out", tmp_path / "run", "--device", "cpu", *QUICK), said)
-    for verb in ("plan", "eval", "render", "export", "view", "demo"):
-        assert_refused(turbogs(verb, ""), said)
-    assert_refused(turbogs("reconstruct", "", "--out", tmp_path / "cameras"), said)
-    for option in (("--out", ""), ("--out=",)):
-        assert_refused(turbogs("train", copy, *option, *QUICK), "--out '': write a value")
-    assert_refused(turbogs("plan", copy, "--init", ""), "--init '': write a value")
+    assert_refused(turbogs(*(copy if word == "SCENE" else word for word in words)), "has no value: write one")
     assert tree(tmp_path) == before
 
 
@@ -244,16 +196,10 @@ def test_a_viewer_has_a_usual_port(turbogs, capture, tmp_path, monkeypatch, view
     def attached(port, host):
         raise InputError(f"at {host}:{port}")
 
-    monkeypatch.setattr("turbogs_plugin.viewer.commands.attached", attached)
+    monkeypatch.setattr("turbogs_plugin.viewer.live.attached", attached)
     out = ("--out", tmp_path / "run")
     words = (*out, *viewer) if last else (*viewer, *out)
     assert_refused(turbogs("train", capture, *QUICK, *words), f"at 127.0.0.1:{port}")
-
-
-@pytest.mark.parametrize("word", ["abc", "train.iterations=2"])
-def test_a_viewer_takes_a_port(turbogs, capture, word):
-    said = f"--viewer '{word}': it takes a whole number"
-    assert_refused(turbogs("train", capture, "--out", "run", "--viewer", word), said)
 
 
 def test_a_run_is_no_capture(turbogs, finished, capture, tmp_path):
@@ -264,10 +210,9 @@ def test_a_run_is_no_capture(turbogs, finished, capture, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("verb", ["eval", "render", "export"])
-def test_verbs_without_a_run(turbogs, tmp_path, verb):
-    assert_refused(turbogs(verb, tmp_path), "holds no run")
-    assert_refused(turbogs("train", "--resume", tmp_path), "holds no run")
+def test_commands_without_a_run(turbogs, tmp_path):
+    for words in (["eval"], ["render"], ["export"], ["train", "--resume"]):
+        assert_refused(turbogs(*words, tmp_path), "holds no run")
     assert not list(tmp_path.iterdir())
 
 
@@ -297,20 +242,16 @@ def test_to_go_on_with_a_finished_run_says_so_and_changes_no_file(turbogs, finis
     assert turbogs("train", "--resume", run)[0] == 0 and (run / "report.md").is_file(), "what was left to do"
 
 
-def test_a_run_whose_configuration_was_cut_is_refused(turbogs, finished, tmp_path):
-    broken = Path(shutil.copytree(finished, tmp_path / "broken"))
-    text = (broken / "config.yaml").read_text()
-    (broken / "config.yaml").write_text(text[: text.index("\nbudget:") + 1])
-    for arguments in (["eval", broken], ["train", "--resume", broken]):
-        assert_refused(turbogs(*arguments), "config.yaml", "lacks 'budget'")
-
-
-def test_a_run_whose_configuration_has_a_wrong_value_is_refused_by_its_file(turbogs, finished, tmp_path):
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [("(?s)\nbudget:.*", "\n", "lacks settings of 'budget'"), ("seed: 0", "seed: -1", "train: seed = -1 is not valid")],
+)
+def test_a_run_with_a_wrong_configuration_is_refused_by_its_file(turbogs, finished, tmp_path, old, new, said):
     run = Path(shutil.copytree(finished, tmp_path / "run"))
     file = run / "config.yaml"
-    file.write_text(file.read_text().replace("seed: 0", "seed: -1"))
+    file.write_text(re.sub(old, new, file.read_text()))
     for arguments in (["eval", run], ["train", "--resume", run]):
-        assert_refused(turbogs(*arguments), f"'{file}': train: seed = -1 is not valid", "bring back")
+        assert_refused(turbogs(*arguments), "config.yaml", said)
 
 
 def test_a_run_whose_capture_moved_says_where_to_tell(turbogs, finished, capture, tmp_path):
@@ -335,16 +276,8 @@ def test_a_finished_run_is_evaluated_rendered_and_exported(turbogs, finished, tm
     assert_refused(turbogs("export", finished, "--out", tmp_path / "mine.ply"), "exists")
 
 
-def test_a_report_links_the_page_only_where_it_is_there(turbogs, finished, tmp_path):
-    run = Path(shutil.copytree(finished, tmp_path / "run"))
-    assert "](model.html)" not in (run / "report.md").read_text()
-    (run / "model.html").touch()
-    (run / "report.md").unlink()
-    assert turbogs("train", "--resume", run)[0] == 0 and "](model.html)" in (run / "report.md").read_text()
-
-
 def test_depth_images_are_in_the_captures_own_units(turbogs, capture, finished):
-    """As the exported model and the capture's own cameras, which are in these units, give them."""
+    """The exported model and the capture's own cameras, which are in these units, give equal depths."""
     code, out, _ = turbogs("render", finished, "--depth", "--device", "cpu")
     folder = finished / "renders" / "test-depth"
     assert code == 0 and str(folder) in out
@@ -363,13 +296,6 @@ def test_depth_images_are_in_the_captures_own_units(turbogs, capture, finished):
 
 def test_version(turbogs):
     assert turbogs("--version") == (0, f"turbogs {__version__}\n", "")
-
-
-def test_doctor(turbogs):
-    code, out, _ = turbogs("doctor")
-    assert code == 0
-    for word in ("torch", "gsplat", "Python", "GPU", "kernels", "nvcc"):
-        assert word in out
 
 
 def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypatch):
@@ -397,7 +323,7 @@ def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(turbogs, capture, t
 def test_a_reader_that_stops_early_is_no_error():
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "turbogs_plugin.cli", "doctor"]
+    command = [sys.executable, "-m", "turbogs_plugin", "doctor"]
     ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (141, "")
@@ -419,17 +345,19 @@ def test_a_run_without_a_report_tells_its_model_and_both_clocks(turbogs, capture
         ("trian x --out y", "no such command 'trian': did you mean 'train'? (known: ablate, bench, "),
         ("train s --out r --fctor 3", "turbogs train: there is no --fctor: did you mean '--factor'?"),
         ("train s --out r --iterations 5", "turbogs train: there is no --iterations: write train.iterations=5; see"),
-        ("eval r --out x", "turbogs eval: there is no --out: known are --device, --factor, --scene; see turbogs eval"),
-        ("train s --out r --factor abc", "--factor 'abc': it takes a whole number; see turbogs train --help"),
-        ("train s --out r --factor=abc", "--factor 'abc': it takes a whole number; see turbogs train --help"),
-        ("train s --out r --device tpu", "--device 'tpu': it takes auto, cpu or cuda; see turbogs train --help"),
-        ("train s --out", "--out lacks a value; see turbogs train --help"),
+        (
+            "eval r --out x",
+            "turbogs eval: there is no --out: known are --device, --factor, --help, --scene;",
+        ),
+        ("train s --out r --factor abc", "--factor takes only whole numbers; see turbogs train --help"),
+        ("render r --seconds abc", "--seconds takes only numbers; see turbogs render --help"),
+        ("ablate parts --out s --seeds a b", "--seeds takes only whole numbers; see turbogs ablate --help"),
+        ("train s --out r --viewer train.seed=1", "--viewer takes only whole numbers; see turbogs train --help"),
+        ("train s --out r --device tpu", "'tpu' is none of auto, cpu, cuda; see turbogs train --help"),
+        ("bench ranks", "turbogs bench: 'ranks' is none of raster, step, wall; see turbogs bench --help"),
         ("train s --out --factor 2", "--out lacks a value; see turbogs train --help"),
-        ("eval", "turbogs eval: it needs RUN; see turbogs eval --help"),
-        ("bench ranks", "turbogs bench: 'ranks': it takes step, raster or wall; see turbogs bench --help"),
+        ("eval", "turbogs eval: it needs RUN|MODEL; see turbogs eval --help"),
         ("ablate parts --seeds 0", "turbogs ablate: it needs --out; see turbogs ablate --help"),
-        ("ablate parts --out s --seeds a b", "--seeds 'a': it takes a whole number; see turbogs ablate --help"),
-        ("doctor --all", "turbogs doctor: there is no --all: known are none; see turbogs doctor --help"),
         ("doctor x", "turbogs doctor: it takes no 'x'; see turbogs doctor --help"),
     ],
 )
@@ -443,17 +371,3 @@ def test_every_command_has_help(turbogs, verb):
     assert code == 0 and f"usage: turbogs {verb}" in out and err == ""
     code, out, err = turbogs()
     assert code == 0 and f"\n  {verb} " in out and err == ""
-
-
-def test_what_is_called_is_called_afterwards(capsys):
-    """A command's own words, and its own end, are no refusal."""
-
-    def command(number: int) -> int:
-        print(number, file=sys.stderr)
-        sys.exit(2)
-
-    call = parsed({"one": command}, ["one", "--number", "3"])
-    assert capsys.readouterr().err == ""
-    with pytest.raises(SystemExit):
-        call()
-    assert capsys.readouterr().err == "3\n"

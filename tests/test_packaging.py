@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 import setuptools
 
-import turbogs_plugin
 from turbogs_plugin import doctor
 from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.errors import InputError
@@ -119,11 +118,6 @@ def test_the_top_level_is_what_was_agreed():
     assert {top for top in tops if not top.startswith(".")} <= TOP_LEVEL
 
 
-def test_the_version_is_in_one_place():
-    assert turbogs_plugin.__version__
-    assert 'dynamic = ["version"]' in (ROOT / "pyproject.toml").read_text()
-
-
 def test_importing_the_command_line_does_not_import_torch():
     code = "import sys, turbogs_plugin.cli; print('torch' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -220,15 +214,11 @@ def test_a_compiler_that_fails_ends_without_a_library(tmp_path, mode):
     ("architectures", "capability", "usable"),
     [
         ("sm_90", (9, 0), True),
-        ("sm_90", (8, 0), False),
         ("sm_90", (10, 0), False),
         ("sm_80", (8, 6), True),
         ("sm_86", (8, 0), False),
-        ("sm_80", (9, 0), False),
-        ("sm_80 sm_90", (8, 9), True),
         ("sm_80 sm_90 compute_90", (12, 0), True),
         ("sm_86 sm_90 compute_90", (8, 0), False),
-        ("sm_90a", (9, 0), True),
         ("sm_100a", (10, 3), False),
         ("sm_100f", (10, 3), True),
         ("sm_80 sm_90a compute_90a", (12, 0), False),
@@ -239,12 +229,6 @@ def test_a_library_has_code_for_a_gpu_or_says_how_to_build_it(architectures, cap
     present = "sm_{}{}".format(*capability)
     remedy = f"this GPU is {present}: rebuild with TURBOGS_CUDA_ARCH={present.removeprefix('sm_')}"
     assert reason == ("" if usable else f"built for {', '.join(architectures.split())}, {remedy}")
-
-
-def test_a_gpu_that_is_too_old_is_told_so():
-    assert (
-        kernels._mismatch(("sm_90",), (7, 5)) == "this GPU is sm_75: the kernels need compute capability 8.0 or newer"
-    )
 
 
 @pytest.fixture

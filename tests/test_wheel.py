@@ -69,8 +69,6 @@ def test_a_wheel_as_make_wheel_builds_it_has_no_fault(checker, tmp_path):
         (library(["80", "90"]), {}, "it holds compute_90, sm_80, sm_90, not sm_80, sm_86, "),
         (library(ARCHITECTURES).replace(b"sm_89 ", b""), {}, "it does not say of itself that it holds sm_80"),
         (library(ARCHITECTURES), {"name": NAME.replace("abi3", "cp310")}, "its tag is not cp310-abi3"),
-        (library(ARCHITECTURES), {"stray": "turbogs_plugin/notes.txt"}, "turbogs_plugin/notes.txt: a stray file"),
-        (library(ARCHITECTURES), {"stray": "turbogs_plugin/viewer.js"}, "turbogs_plugin/viewer.js: a stray file"),
         (library(ARCHITECTURES), {"stray": "strategies/losses.py"}, "strategies/losses.py: a stray file"),
         (library(ARCHITECTURES), {"stray": "turbogs_plugin/_C.cpython-311.so"}, "_C.cpython-311.so: a stray file"),
     ],
@@ -92,9 +90,7 @@ def test_what_ties_a_library_to_a_version_is_named(checker, tmp_path, monkeypatc
 @pytest.mark.parametrize(
     ("capability", "line"),
     [
-        ((8, 7), None),
         ((10, 3), None),
-        ((12, 1), None),
         ((13, 0), None),  # by PTX
         ((7, 5), "kernels: this GPU is sm_75: the kernels need compute capability 8.0 or newer"),
         ((11, 0), "this GPU is sm_110: rebuild with TURBOGS_CUDA_ARCH=110"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
-import subprocess
 from importlib.metadata import PackageNotFoundError, version
 
 import torch
@@ -20,7 +19,7 @@ REQUIREMENTS = (
     "filelock>=3.12",
     "scipy>=1.10",
     "trimesh>=4.0",
-    "tyro>=0.9",
+    "tyro>=1.0.17,<1.1",
     "rich>=13.0",
     "matplotlib>=3.8",
 )
@@ -38,7 +37,9 @@ def diagnosis() -> str:
     usable = "not usable" if missing else f"loaded from {kernels.path}, for {', '.join(kernels.architectures)}"
     lines = [f"{name:<16}{version}" for name, version in software()]
     lines += [f"{'machine':<16}{hardware('cuda' if torch.cuda.is_available() else 'cpu')}"]
-    lines += [f"{'GPU':<16}{line}" for line in _gpus()]
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    for index, gpu in enumerate(map(torch.cuda.get_device_properties, range(count))):
+        lines.append(f"{'GPU':<16}{index}: {gpu.name}, sm_{gpu.major}{gpu.minor}, {gpu.total_memory / 2**30:.0f} GiB")
     lines += [f"{'nvcc':<16}{shutil.which('nvcc') or 'not found'}", f"{'kernels':<16}{usable}"]
     if torch.version.cuda is None:
         missing.append("CUDA in PyTorch: training runs on the CPU, by the torch reference")
@@ -73,23 +74,3 @@ def lacking_packages() -> list[str]:
         elif not wanted.specifier.contains(found, prereleases=True):
             lacking.append(f"{requirement} ({found} is installed)")
     return lacking
-
-
-def _gpus() -> list[str]:
-    if not torch.cuda.is_available():
-        return ["none"]
-    names = []
-    for index in range(torch.cuda.device_count()):
-        gpu = torch.cuda.get_device_properties(index)
-        memory = f"{gpu.total_memory / 2**30:.0f} GiB"
-        names.append(f"{index}: {gpu.name}, sm_{gpu.major}{gpu.minor}, {memory}, driver {_driver()}")
-    return names
-
-
-def _driver() -> str:
-    command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
-    try:
-        answer = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-    return answer.stdout.split("\n")[0].strip()

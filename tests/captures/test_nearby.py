@@ -10,7 +10,7 @@ from PIL import Image
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.kinds import holds_photos_alone
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.reconstruct.photos import list_photos
+from turbogs_plugin.reconstruct.photos import read_photos
 
 
 @pytest.fixture
@@ -91,5 +91,5 @@ def test_a_run_is_no_folder_of_photos(tmp_path, part):
     said = f"{run} is a run's folder: give the capture that it was trained on, which its config.yaml names"
     assert refusal(run) == said
     with pytest.raises(InputError) as refused:
-        list_photos(run)
+        read_photos(run)
     assert str(refused.value) == said

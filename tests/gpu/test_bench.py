@@ -1,5 +1,7 @@
 """Benches on the GPU: the fused steps are marked, nothing is lost, and floors are below what was measured."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,6 @@ from turbogs_plugin.bench.raster import STAGES, bench_raster
 from turbogs_plugin.bench.step import bench_step
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.cuda import library as kernels
-from turbogs_plugin.study.cell import scene_on
 
 pytestmark = [
     pytest.mark.gpu,
@@ -23,7 +24,8 @@ GPU = torch.device("cuda")
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     pytest.importorskip("pycolmap", reason="the capture is written by pycolmap")
-    return scene_on(load_scene(tiny_capture(tmp_path_factory.mktemp("bench"))), GPU)
+    loaded = load_scene(tiny_capture(tmp_path_factory.mktemp("bench")))
+    return replace(loaded, train=loaded.train.to(GPU), test=loaded.test.to(GPU))
 
 
 def test_steps_on_the_kernels(scene):

@@ -52,16 +52,8 @@ def test_photos_at_a_ghost_are_a_group_of_their_own(ghosts, repeated):
 def test_the_pairs_of_a_ghost_are_those_that_agree_across():
     agreement = walk(16, 5, range(4), repeated=20)
     marked = agreement.pairs[ghost_pairs(agreement, consistent_groups(agreement))]
-    assert len(marked) == 12 * 4 - (5 + 4 + 3 + 2)  # those of the walk contradict
+    assert len(marked) == 12 * 4 - (5 + 4 + 3 + 2)  # the walk's own pairs contradict
     assert all((first < 4) != (second < 4) and second - first > 5 for first, second in marked)
-
-
-def test_doubt_names_what_the_majority_does_not():
-    agreement = Agreement(
-        ("a", "b", "c"), np.array([[0, 1], [1, 2], [0, 2]]), np.array([90, 50, 5]), np.array([0, 40, 15])
-    )
-    assert consistent_groups(agreement) == [[0, 1, 2]]
-    assert consistent_groups(agreement, doubt=2.0) == [[0, 1], [2]]
 
 
 def test_many_weak_pairs_of_a_large_capture_do_not_outweigh_the_strong_ones():

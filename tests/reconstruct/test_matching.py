@@ -57,7 +57,7 @@ def test_photos_with_gps_are_matched_with_the_nearest():
     assert reason == "with the 40 nearest by GPS"
     metres = metres_of(positions)
     apart = np.linalg.norm(metres[pairs[:, 0]] - metres[pairs[:, 1]], axis=1)
-    assert apart.max() < 200  # of up to 560
+    assert apart.max() < 200  # the flight is 560 m across
     assert (np.bincount(pairs.ravel(), minlength=500) >= matching.NEIGHBORS).all()
 
 
@@ -81,10 +81,8 @@ def test_photos_without_gps_among_those_with_it_are_matched_by_order():
     ("names", "ordered"),
     [
         (["a/1.jpg", "a/2.jpg", "a/4.jpg"], True),
-        (["IMG_0001.JPG", "IMG_0003.JPG"], True),
         (["IMG_0001.JPG", "IMG_0500.JPG"], False),
         (["left.jpg", "right.jpg"], False),
-        (["a1.jpg", "b2.jpg"], False),
         (["one.jpg"], False),
     ],
 )

@@ -1,7 +1,6 @@
 """What photos' files say, and upright copies."""
 
 import io
-import os
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from helpers.refusals import assert_refused
 from PIL import Image
 
 from turbogs_plugin.captures.decoding import load_photos, photo_array, photo_sizes
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct import solver
 from turbogs_plugin.reconstruct.photos import place_photos, read_photos
 
@@ -18,7 +16,7 @@ TURNS = {1: None, 3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8
 
 
 def picture(seed: int = 0, size: tuple[int, int] = (48, 32)) -> Image.Image:
-    """Of coarse blocks, that JPEG keeps nearly."""
+    """Picture of coarse blocks, which JPEG nearly keeps."""
     width, height = size
     blocks = np.random.default_rng(seed).integers(0, 256, (height // 16, width // 16, 3), dtype=np.uint8)
     return Image.fromarray(blocks.repeat(16, axis=0).repeat(16, axis=1))
@@ -88,15 +86,12 @@ def test_upright_copies_keep_focal_length_and_gps(suffix, tmp_path):
     assert turned.exif_latitude() == pytest.approx(-33.5) and turned.exif_longitude() == pytest.approx(151.25)
 
 
-@pytest.mark.parametrize(
-    ("text", "number"), [(b"\x01\x0e", b"\x01\x1a"), (b"\0\x1d", b"\0\x0d")], ids=["XResolution", "GPSSpeed"]
-)
-def test_a_photo_whose_exif_cannot_be_written_again_is_turned(text, number, tmp_path):
-    """It has a number as text: a tag of text (description, GPS date) is given the name of a number's."""
+def test_a_photo_whose_exif_cannot_be_written_again_is_turned(tmp_path):
+    """Its GPS speed is a text: the tag of the GPS date is given the number of the speed's."""
     exif = Image.Exif()
     exif[0x0112] = 6
-    exif[0x010E] = exif.get_ifd(0x8825)[0x1D] = "72 dots"
-    spoilt = exif.tobytes().replace(text + b"\0\2", number + b"\0\2")
+    exif.get_ifd(0x8825)[0x1D] = "72 dots"
+    spoilt = exif.tobytes().replace(b"\0\x1d\0\2", b"\0\x0d\0\2")
     (tmp_path / "raw").mkdir()
     for view in range(3):
         picture().transpose(TURNS[6]).save(tmp_path / f"raw/{view}.jpg", exif=spoilt)
@@ -145,55 +140,23 @@ def test_names_have_no_spaces_and_folders_are_kept(tmp_path):
     ]
 
 
-def test_a_folder_images_is_where_the_photos_are(tmp_path):
-    for number in range(3):
-        write(tmp_path / "images" / f"{number}.jpg")
-    write(tmp_path / "poster.jpg")
-    assert [photo.name for photo in read_photos(tmp_path)] == ["0.jpg", "1.jpg", "2.jpg"]
-    (tmp_path / "images").rename(tmp_path / "walk_2")
-    (tmp_path / "images").mkdir()
-    assert [photo.name for photo in read_photos(tmp_path)] == ["poster.jpg", *(f"walk_2/{n}.jpg" for n in range(3))]
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        (None, "no such folder"),
-        ({}, "no photos: at least 3"),
-        ({"a.jpg": picture()}, "has 1 photo: at least 3"),
-        (
-            {"IMG_1.HEIC": b"x"},
-            r"has no photos \(1 file is of a kind that is not read \(IMG_1.HEIC\): convert to JPEG\)",
-        ),
-        ({"images/walk.MOV": b"x"}, r"has no photos \(walk.MOV is a video: take photos out of it, as by  ffmpeg .*\)"),
+        ({}, "has 0 photos: at least 3"),
+        ({"IMG_1.HEIC": b"x"}, r"has 0 photos \(1 file is of a kind that is not read \(IMG_1.HEIC\)"),
         ({"3.jpg": jpeg()[:-200]}, "cannot read the photo .*3.jpg.*replace it"),
         ({"5.png": Image.fromarray(np.zeros((32, 48), dtype=np.uint16))}, "5.png has more than 8 bits"),
         ({"a b.jpg": picture(), "a_b.jpg": picture()}, "2 photos .*'a_b.jpg' without spaces"),
-        ({os.fsdecode(b"\xfc0.jpg"): picture()}, "0.jpg' has signs that cannot be printed: rename the photo"),
     ],
 )
 def test_unusable_photos_are_refused(changes, words, tmp_path):
     folder = tmp_path / "photos"
-    if changes is not None:
-        folder.mkdir()
-        good = any(len(changes) > 1 or name[0] in "35" or not name.isascii() for name in changes)
-        for name, content in {**{f"{n}.jpg": picture() for n in range(4) if good}, **changes}.items():
-            (folder / name).parent.mkdir(exist_ok=True)
-            if isinstance(content, bytes):
-                (folder / name).write_bytes(content)
-            else:
-                with open(folder / name, "wb") as file:
-                    content.save(file, "PNG" if name.endswith("png") else "JPEG")
+    folder.mkdir()
+    good = any(len(changes) > 1 or name[0] in "35" for name in changes)
+    for name, content in {**{f"{n}.jpg": picture() for n in range(4) if good}, **changes}.items():
+        if isinstance(content, bytes):
+            (folder / name).write_bytes(content)
+        else:
+            content.save(folder / name)
     assert_refused(words, read_photos, folder)
-
-
-def test_a_photo_of_another_format_is_refused(tmp_path):
-    for number in range(3):
-        picture().save(tmp_path / f"{number}.jpg", format="GIF" if number == 2 else "JPEG")
-    assert_refused("2.jpg has GIF inside, .*: convert it to JPEG", read_photos, tmp_path)
-
-
-def test_a_video_in_the_place_of_a_folder_is_named(tmp_path):
-    (tmp_path / "walk.mp4").write_bytes(b"x")
-    with pytest.raises(InputError, match=r"walk.mp4; walk.mp4 is a video: take photos out of it, as by  ffmpeg"):
-        read_photos(tmp_path / "walk.mp4")

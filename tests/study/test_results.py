@@ -15,7 +15,6 @@ from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.study.grid import Ablation, CellKey
 from turbogs_plugin.study.results import (
     CellResult,
-    Failure,
     Study,
     StudyFolder,
     changes,
@@ -46,7 +45,7 @@ def study() -> Study:
     results = [result(variant, seed) for variant in ABLATION.variants for seed in (0, 1)]
     results[3] = replace(results[3], provenance=replace(HERE, machine="another"), capture="")
     results.append(result("base", 0, "h", provenance=None, lpips_reason="no weights"))
-    return Study(ABLATION, results, [Failure(CellKey("h", "other", 1), "it broke")])
+    return Study(ABLATION, results)
 
 
 @pytest.fixture
@@ -102,15 +101,6 @@ def test_a_file_that_is_wrong_is_refused_by_name(folder, changed, words):
         folder.read_study()
 
 
-@pytest.mark.parametrize("column", [[1.0], None])
-def test_a_curve_that_is_wrong_is_refused(folder, column):
-    document = json.loads(folder.file.read_text())
-    document["cells"][1]["curve"]["psnr"] = column
-    folder.file.write_text(json.dumps(document))
-    with pytest.raises(InputError, match=r"results.json' does not hold results"):
-        folder.read_study()
-
-
 VALUES = st.sampled_from([0, 1.5, True, "", "x", [], [1, 2.0]])
 FLAT = st.dictionaries(st.sampled_from(["loss.type", "loss.rate", "density.until", "plan.x"]), VALUES)
 
@@ -128,19 +118,10 @@ def test_a_cell_that_is_not_in_the_results_yet_is_not_lost(folder):
     new = result("other", 1, "h")
     folder.write(new)
     read = folder.read_study()
-    assert read.results[-1] == new and not read.failures, "a failure is forgotten when its cell is there"
+    assert read.results[-1] == new
     folder.write_study(read)
     (folder.cells / new.key.file).unlink()
     assert len(folder.read_study().results) == 6
-
-
-def test_failures_are_forgotten_where_they_are_tried_again(folder):
-    broken = Failure(CellKey("h", "base", 1), "no luck")
-    folder.write(broken)
-    folder.write(result("base", 2, "h"))
-    assert [failure.reason for failure in folder.read_study().failures] == ["it broke", "no luck"]
-    folder.forget_failures()
-    assert not folder.ended(broken.key) and folder.ended(CellKey("h", "base", 2))
 
 
 def test_a_cell_of_another_ablation_is_refused(folder):

@@ -5,7 +5,6 @@ import multiprocessing
 import shutil
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -94,7 +93,7 @@ def test_a_study_is_complete_and_goes_on_where_it_stopped(turbogs, small, captur
     out, seeds = tmp_path / "study", ("--seeds", "0", "1", "2")
     code, printed, err = turbogs(*call(small, capture, out, *seeds))
     assert code == 0 and str(out / "report.md") in printed
-    assert "[6/6]" in err and "min" in err
+    assert "[6/6]" in err
     cells = sorted(out.glob("cells/capture/*.json"))
     assert [path.name for path in cells] == [f"{name}--seed{n}.json" for name in ("full", "random") for n in range(3)]
     results = StudyFolder(out).read_study().results
@@ -105,24 +104,14 @@ def test_a_study_is_complete_and_goes_on_where_it_stopped(turbogs, small, captur
     )
     page = (out / "report.md").read_text()
     mean = np.mean([result.final["psnr"] for result in results[3:]])
-    worst = np.mean([result.final["worst_psnr"] for result in results[3:]])
-    for word in (
-        f"| {mean:.2f} ± ",
-        f"| {worst:.2f} ± ",
-        "a \\| bar",
-        "torch",
-        "★",
-        "error-over-time.png",
-        "LPIPS was not",
-    ):
+    for word in (f"| {mean:.2f} ± ", "a \\| bar", "★", "error-over-time.png", "LPIPS was not"):
         assert word in page, word
     assert sorted(path.name for path in out.iterdir()) == [
-        "cells", "error-over-size.png", "error-over-time.png", "report.md", "results.json",
+        "cells", "error-over-time.png", "report.md", "results.json",
     ]  # fmt: skip
     no_training(monkeypatch)
     stamps = [path.stat().st_mtime_ns for path in cells]
-    code, _, err = turbogs(*call(small, capture, out, *seeds))
-    assert code == 0 and "6 finished cells are kept" in err
+    assert turbogs(*call(small, capture, out, *seeds))[0] == 0
     assert [path.stat().st_mtime_ns for path in cells] == stamps
     shutil.rmtree(out / "cells")
     assert turbogs(*call(small, capture, out, *seeds))[0] == 0, "results.json alone is enough"
@@ -142,11 +131,10 @@ def test_a_broken_cell_is_reported_and_tried_again(turbogs, small, capture, tmp_
     monkeypatch.setattr(Trainer, "step", broken)
     code, printed, err = turbogs(*call(small, capture, out))
     assert code == 1 and "no such kernel" in printed and "FAILED" in err
-    assert "no such kernel" in (out / "report.md").read_text()
+    assert [result.variant for result in StudyFolder(out).read_study().results] == ["random"]
     monkeypatch.setattr(Trainer, "step", step)
     code, _, err = turbogs(*call(small, capture, out))
-    assert code == 0 and "1 finished cells are kept" in err and "[1/1]" in err
-    assert "no such kernel" not in (out / "report.md").read_text()
+    assert code == 0 and "[1/2]" in err and "[2/2]" not in err, "the other cell is kept"
 
 
 def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, study):
@@ -158,14 +146,10 @@ def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, study
     assert {path: path.read_bytes() for path in study.rglob("*") if path.is_file()} == before
 
 
-def test_another_capture_of_the_same_name_is_not_taken_for_the_first(turbogs, small, capture, study, tmp_path):
-    (tmp_path / "moved").mkdir()
-    moved = shutil.copytree(capture, tmp_path / "moved" / capture.name)
-    code, _, err = turbogs(*call(small, moved, study, "--only", "full"))
-    assert code == 0 and "1 finished cells are kept" in err
+def test_another_capture_of_the_same_name_is_not_taken_for_the_first(turbogs, small, study, capture, tmp_path):
     other = write_demo_capture(tmp_path / capture.name, views=9, width=48, height=40)
     code, _, err = turbogs(*call(small, other, study, "--only", "full", "--seeds", "1"))
-    assert code == 2 and "other photos or cameras" in err
+    assert code == 2 and "has other photos than its kept cells" in err
 
 
 def test_a_process_warms_up_once_for_a_variant_and_capture(turbogs, small, capture, tmp_path, monkeypatch):
@@ -210,7 +194,7 @@ def test_an_interrupted_study_reports_what_is_there(turbogs, small, capture, tmp
     assert [result.variant for result in StudyFolder(out).read_study().results] == ["full"]
     monkeypatch.setattr(Trainer, "step", step)
     code, _, err = turbogs(*call(small, capture, out))
-    assert code == 0 and "1 finished cells are kept" in err and "[1/1]" in err
+    assert code == 0 and "[2/2]" in err and "[1/2]" not in err
 
 
 def test_variants_of_one_study_may_be_trained_by_several_calls(turbogs, capture, tmp_path):
@@ -237,7 +221,7 @@ def test_two_workers_train_each_cell_once(small, tmp_path, monkeypatch, capfd):
     told = capfd.readouterr().err
     assert not end.value.code, told
     study = StudyFolder(tmp_path / "study").read_study()
-    assert len(study.results) == 4 and not study.failures
+    assert len(study.results) == 4
     trained = [line.partition("] ")[2].partition(":")[0] for line in told.splitlines() if " dB in " in line]
     assert len(trained) == 4 == len(set(trained))
     assert (tmp_path / "study/report.md").is_file()
@@ -249,59 +233,30 @@ def claim(folder: StudyFolder, key: CellKey, claimed, end) -> None:
         end.wait()
 
 
-def test_a_cell_that_another_process_trains_is_waited_for_and_taken_over_when_that_dies(
-    small, capture, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(run_cells, "POLL_SECONDS", 0.0)
+def test_a_cell_that_another_process_trains_is_left_to_it_until_that_dies(small, capture, tmp_path, monkeypatch):
     folder, context = StudyFolder(tmp_path / "study"), multiprocessing.get_context("fork")
     folder.write_study(run_cells.Study(load_ablation(str(small)), []))
     key, claimed, end = CellKey(capture.name, "full", 0), context.Event(), context.Event()
     other = context.Process(target=claim, args=(folder, key, claimed, end))
     other.start()
     claimed.wait()
-    waited = []
-
-    def wait(seconds: float) -> None:
-        assert not folder.ended(key)
-        waited.append(seconds)
-        other.kill()
-        other.join()
-
-    clock = SimpleNamespace(sleep=wait, perf_counter=run_cells.time.perf_counter)
-    monkeypatch.setattr(run_cells, "time", clock)
     choice = CellChoice([capture], only=["full"], overrides=SETTINGS, steps=4, device="cpu")
+    with monkeypatch.context() as patch:
+        no_training(patch)
+        assert run_study(load_ablation(str(small)), choice, folder.path) == []
+    other.kill()
+    other.join()
     assert run_study(load_ablation(str(small)), choice, folder.path) == []
-    assert len(waited) == 1 and [result.key for result in folder.read_study().results] == [key]
-
-
-def test_a_cell_that_another_process_ended_meanwhile_is_kept(small, capture, tmp_path, monkeypatch):
-    """It ends after this process has seen what is there, and before it takes the cell."""
-    choice = CellChoice([capture], only=["full"], overrides=SETTINGS, steps=4, device="cpu")
-    ablation, folder, write_study = load_ablation(str(small)), StudyFolder(tmp_path / "study"), StudyFolder.write_study
-
-    def write(self: StudyFolder, study) -> None:
-        write_study(self, study)
-        monkeypatch.setattr(StudyFolder, "write_study", write_study)
-        run_study(ablation, choice, folder.path)
-        no_training(monkeypatch)
-
-    monkeypatch.setattr(StudyFolder, "write_study", write)
-    assert run_study(ablation, choice, folder.path) == []
-    assert len(folder.read_study().results) == 1
+    assert [result.key for result in folder.read_study().results] == [key]
 
 
 # Cells
 
 
-def test_the_digest_of_a_capture_is_of_names_sizes_and_cameras(capture):
+def test_the_digest_of_a_capture_is_of_names_and_sizes(capture):
     scene = load_scene(capture)
     before = capture_digest(scene)
     assert capture_digest(load_scene(capture)) == before != capture_digest(load_scene(capture, 2))
-    for part in (scene.train, scene.test):
-        unchanged = part.cameras.viewmats
-        part.cameras.viewmats = unchanged + 1e-3
-        assert capture_digest(scene) != before
-        part.cameras.viewmats = unchanged
     scene.train.names = ("other", *scene.train.names[1:])
     assert capture_digest(scene) != before
 
@@ -309,7 +264,7 @@ def test_the_digest_of_a_capture_is_of_names_sizes_and_cameras(capture):
 def test_a_cell_has_the_planned_length_and_keeps_a_cap_on_gaussians(tmp_path, monkeypatch):
     scene = load_scene(tiny_capture(tmp_path))
     monkeypatch.setitem(RULES, "train.iterations", lambda facts, config: Verdict(6, "few"))
-    capped = ["train.iterations=auto", "train.base_iterations=14", "density.max_gaussians=90"]
+    capped = ["train.iterations=auto", "density.max_gaussians=90"]
     result = train_cell("x", load_config("turbogs", [*TINY, *capped]), scene, torch.device("cpu"), provenance("cpu"))
     assert result.final["iteration"] == 6 == result.planned["train.iterations"]
     assert max(result.curve["gaussians"]) <= 90 and result.settings["train.iterations"] == "auto"
@@ -329,8 +284,7 @@ def test_a_limit_of_memory_which_is_of_a_process_is_refused():
         ("ablate components --scene absent --out X", ["no such scene"]),
         ("ablate components --scene CAPTURE --out X --only +geo", ["+geo-vs"]),
         ("ablate components --scene CAPTURE --out X --seeds 1 1", ["seeds"]),
-        ("ablate components --scene CAPTURE --scene CAPTURE --out X", ["two folders are called"]),
-        ("ablate components --scene CAPTURE --out X --steps 0", ["--steps 0"]),
+        ("ablate components --scene CAPTURE --scene CAPTURE --out X", ["are called the same"]),
         ("ablate components --scene CAPTURE --out X --gpus 0", ["--gpus 0"]),
         ("ablate components budget.time=1s --scene CAPTURE --out X --steps 4", ["time budget 1s exclude each other"]),
         ("ablate components --scene CAPTURE --out CAPTURE", ["not empty"]),

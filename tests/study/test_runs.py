@@ -11,7 +11,6 @@ from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.results import StudyFolder
 from turbogs_plugin.study.runs import study_of_runs
-from turbogs_plugin.train.clock import WallRecord
 from turbogs_plugin.train.history import Evaluation, append_evaluation
 
 pytestmark = pytest.mark.usefixtures("plotted")
@@ -70,9 +69,7 @@ def test_a_stopped_run_is_refused(tmp_path):
     [
         (["scene.path=/a/fox"], ["fox"]),
         (["scene.path=/b/fox"], ["fox", "fox-2"]),
-        (["scene.path=/a/bear", "scene.factor=2"], ["fox", "bear"]),
         (["scene.path=/a/fox", "scene.factor=2"], ["fox", "fox-2"]),
-        (["scene.path=/a/fox", "scene.test_every=4"], ["fox", "fox-2"]),
     ],
 )
 def test_captures_that_share_a_name_are_kept_apart(tmp_path, second, names):
@@ -105,15 +102,3 @@ def test_runs_that_were_asked_the_same_are_seeds_whatever_plan_and_budgets_made_
     (tmp_path / "a" / "asked.yaml").unlink()
     with pytest.raises(InputError, match=r"asked\.yaml"):
         study_of_runs(runs)
-
-
-def test_seconds_on_the_wall_are_shown_where_a_run_recorded_them(turbogs, tmp_path):
-    runs = [a_run(tmp_path / name, 30, "scene.path=/a/fox", f"train.seed={seed}") for seed, name in enumerate("xy")]
-    runs.append(a_run(tmp_path / "z", 30, "scene.path=/a/fox", "schedule.pixel_budget=2.0"))
-    assert turbogs("report", *runs, "--out", tmp_path / "without")[0] == 0
-    assert "| whole command in s |" not in (tmp_path / "without/report.md").read_text()
-    for path, seconds in zip(runs, (25.0, 27.0), strict=False):
-        WallRecord(20.0, seconds).write(path / "wall.json")
-    assert turbogs("report", *runs, "--out", tmp_path / "with")[0] == 0
-    page = (tmp_path / "with/report.md").read_text()
-    assert "| whole command in s |" in page and "| 26.0 ± 1.0 | " in page

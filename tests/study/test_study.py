@@ -16,7 +16,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.grid import PACKAGE, Ablation, load_ablation, variant_config
 from turbogs_plugin.study.results import CellResult, Study, curve_and_final
 from turbogs_plugin.study.statistics import Difference, Spread, mean_curve, pareto_front, seconds_to_reach, summarise
-from turbogs_plugin.study.study_plots import draw_over_size, draw_over_time, shown_rows
+from turbogs_plugin.study.study_plots import draw_over_time, shown_rows
 from turbogs_plugin.study.study_report import report_text
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.yaml_json import packaged_names
@@ -48,20 +48,8 @@ def test_every_packaged_ablation_resolves_and_its_variants_differ(name):
     assert all("seed: 3" in text for text in texts.values())
 
 
-def test_the_tables_of_the_paper_are_there():
-    assert set(packaged_names(PACKAGE)) >= {
-        "baselines",
-        "bounds",
-        "components",
-        "departures",
-        "paper_parts",
-        "parts",
-        "views",
-        "hard_ratio",
-        "schedule",
-    }
+def test_the_last_row_of_the_components_is_the_default():
     components = load_ablation("components")
-    assert list(components.variants)[:5] == ["3dgs", "+err-sps", "+geo-vs", "+sparse-ncc", "+err-dp"]
     assert variant_config(components, "turbogs", 0, (), None).to_yaml() == load_config("turbogs").to_yaml()
 
 
@@ -138,11 +126,8 @@ def test_events_that_come_sooner_take_less_of_the_opacities():
     [
         ("title: x\nvariants: {}", "at least one"),
         ("title: x\nvariants: {a/b: []}", "a/b"),
-        ("title: x\nvariants: {..: []}", ".."),
         ("title: x\nvariants: {full: []}\nbaseline: ful", "did you mean 'full'"),
-        ("title: x\nvariant: {a: []}", "variants"),
         ("variants: {a: []}", "title"),
-        ("title: x\nvariants: {1: []}", "name 1 is not text: put it in quotes, '1'"),
         ("title: x\nvariants: {a: []}\nnotes: {true: b}", "name True is not text"),
         ("title: x\nvariants: {a: train.seed=1}", "list"),
     ],
@@ -181,15 +166,9 @@ def test_spreads_and_unpaired_differences():
     assert apart.clear is True
     assert Difference.of([30.2, 30.7, 29.9], [30.0, 30.2, 30.1]).clear is False
     assert Difference.of([31.0, 31.0, 31.0], [30.0, 30.0, 30.0]).clear is True
-    assert Difference.of([31.0], [30.0]).clear is None and Difference.of([31.0], [30.0]).mean == 1.0
+    assert Difference.of([31.0, 31.1], [30.0, 30.2, 30.1]).clear is None, "two seeds"
+    assert Difference.of([31.0], [30.0]).mean == 1.0
     assert math.isnan(Difference.of([31.0], []).mean)
-
-
-@pytest.mark.parametrize("seeds", [2, 3])
-def test_a_difference_is_clear_from_three_seeds_on(seeds):
-    own, base = [31.0, 31.01, 31.02][:seeds], [30.0, 30.01, 30.02]
-    assert Difference.of(own, base).clear is (True if seeds == 3 else None)
-    assert Difference.of(base, own).clear is (True if seeds == 3 else None)
 
 
 def test_the_order_of_seeds_decides_nothing():
@@ -291,19 +270,15 @@ def test_a_variant_that_failed_does_not_set_the_scale_of_the_plots():
     assert [row.name for row in shown_rows(summary)] == ["good", "fair", "unknown"]
 
 
-def test_a_study_has_two_plots_of_all_its_captures():
+def test_the_plot_of_a_study_has_all_its_captures():
     cells = [
         cell(name, seed, entry(0, 0.0, 20.0), entry(100, 10.0 + seed, 30.0), scene=scene)
         for name in ("a", "b")
         for seed in (0, 1)
         for scene in ("fox", "h")
     ]
-    summaries = summarise(Study(Ablation("x", {"a": [], "b": []}), cells))
-    over_time, over_size = draw_over_time(summaries), draw_over_size(summaries)
-    assert [axes.get_title() for axes in over_time.axes] == ["fox", "fox", "h", "h"]
-    assert [axes.get_ylabel() for axes in over_time.axes[:2]] == ["test PSNR in dB", "test SSIM"]
-    assert [axes.get_title() for axes in over_size.axes] == ["fox", "h"]
-    np.testing.assert_allclose(over_time.axes[2].get_lines()[1].get_xdata(), [0.0, 10.5])
-    for figure in (over_time, over_size):
-        (legend,) = figure.legends
-        assert [text.get_text() for text in legend.get_texts()] == ["a", "b"], "each variant once"
+    figure = draw_over_time(summarise(Study(Ablation("x", {"a": [], "b": []}), cells)))
+    assert [axes.get_title() for axes in figure.axes] == ["fox", "fox", "h", "h"]
+    np.testing.assert_allclose(figure.axes[2].get_lines()[1].get_xdata(), [0.0, 10.5])
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["a", "b"], "each variant once"

@@ -128,7 +128,7 @@ def time_iterations(trainer: Trainer, repeats: int, bandwidth: float) -> dict[st
     if isinstance(recorder.rendered, CudaRendered):
         counts |= raster_counts(recorder.rendered, samples)
         floors = step_floors(counts, bandwidth)
-    marks = [Mark(device)]  # of the ends of iterations on the device, which may have to wait for the host
+    marks = [Mark(device)]  # ends of iterations on the device, which may have to wait for the host
     for _ in range(repeats):
         trainer.step()
         marks.append(Mark(device))

@@ -114,7 +114,7 @@ class Recorder:
 
     Attributes:
         spans: name -> spans in the order of the calls.
-        rendered, samples: those of the latest forward pass of a trainer that is `recorded`.
+        rendered, samples: results of the latest forward pass of a trainer that is `recorded`.
     """
 
     rendered: Rendered

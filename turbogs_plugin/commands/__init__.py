@@ -1,6 +1,6 @@
 """What each command of `turbogs` takes, checks and calls. What it calls is imported when it is called."""
 
-from turbogs_plugin.commands import captures, machine, models, studies, training
+from turbogs_plugin.commands import machine, models, studies, training
 from turbogs_plugin.commands.parsing import Command
 
 COMMANDS: dict[str, Command] = {
@@ -10,10 +10,10 @@ COMMANDS: dict[str, Command] = {
     "render": models.render,
     "export": models.export,
     "view": models.view,
-    "reconstruct": captures.reconstruct,
+    "reconstruct": training.reconstruct,
     "ablate": studies.ablate,
     "report": studies.report,
     "bench": machine.bench,
-    "demo": captures.demo,
+    "demo": training.demo,
     "doctor": machine.doctor,
 }

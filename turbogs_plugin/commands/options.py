@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -29,7 +29,6 @@ Count = Annotated[int | None, arg(metavar="N")]
 Time = Annotated[str | None, arg(metavar="20s")]
 Decibels = Annotated[tuple[float, ...], arg(metavar="DB ...")]
 Scene = Annotated[Path | None, arg(metavar="SCENE")]
-Studies = Annotated[tuple[Path, ...], arg(metavar="STUDY ...")]
 RunOrModel = Annotated[Positional[Path], arg(metavar="RUN|MODEL")]
 
 
@@ -67,7 +66,8 @@ class RunOptions:
         if self.max_gaussians is not None and self.max_gaussians < 1:
             raise InputError(f"--max-gaussians {self.max_gaussians}: it must be at least 1; leave it out for no limit")
         given = {"scene.factor": self.factor, "train.device": self.device, "train.init": self.init}
-        more = (*settings_of(given), *budget_overrides(self.max_memory, self.time_budget))
+        given |= {"budget.max_memory": self.max_memory, "budget.time": self.time_budget}
+        more = [f"{name}={json.dumps(value)}" for name, value in given.items() if value is not None]
         asked = DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *more)
         settings = load_config(*asked)
         require_one_length(*asked)
@@ -111,30 +111,11 @@ Given = Annotated[GivenOptions, arg(name="")]
 NO_SCENE = GivenOptions()
 
 
-def settings_of(given: Mapping[str, object]) -> tuple[str, ...]:
-    """Options as overrides: name of a setting -> value, or None where the option is absent."""
-    return tuple(f"{name}={json.dumps(value)}" for name, value in given.items() if value is not None)
-
-
-def budget_overrides(max_memory: str | None, time_budget: str | None) -> tuple[str, ...]:
-    """The options of a budget as overrides."""
-    return settings_of({"budget.max_memory": max_memory, "budget.time": time_budget})
-
-
-def read_amount(option: str, text: str, parse: Callable[[str], float]) -> float:
-    """`parse` of an option's value. Raises `InputError`, which names the option, where it is no amount."""
-    try:
-        return parse(text)
-    except InputError as error:
-        raise InputError(f"{option} {error}") from None
-
-
 def is_change(scene: Path) -> bool:
     """Whether the word in the place of a capture is a change of the configuration."""
     return OVERRIDE.fullmatch(str(scene)) is not None and not scene.exists()
 
 
-def require_positive(option: str, values: Sequence[float], most: float = math.inf) -> None:
-    if not all(0 < value <= most and math.isfinite(value) for value in values):
-        limit = f"at most {most:g}" if math.isfinite(most) else "finite"
-        raise InputError(f"{option} {' '.join(map(str, values))}: it must be more than 0 and {limit}")
+def require_positive(option: str, values: Sequence[float]) -> None:
+    if not all(0 < value < math.inf for value in values):
+        raise InputError(f"{option} {' '.join(map(str, values))}: it must be more than 0 and finite")

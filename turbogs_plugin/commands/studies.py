@@ -50,7 +50,7 @@ def ablate(
     choice = CellChoice(scene, seeds, only, overrides, steps, device)
     failures = run_study(load_ablation(name), choice, out, gpus)
     for failure in failures:
-        print(f"failed  {failure.key}: {failure.reason}")
+        print(f"failed  {failure}")
     return 1 if failures else 0
 
 

@@ -1,8 +1,7 @@
-"""`turbogs train` and `turbogs plan`."""
+"""`turbogs train`, `plan`, and `reconstruct` and `demo`, which write captures to train on."""
 
 from __future__ import annotations
 
-import gc
 import shlex
 import sys
 from contextlib import ExitStack
@@ -63,22 +62,15 @@ def train(
             )
     elif scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
-    elif is_change(scene):
-        raise InputError(f"train needs a SCENE: '{scene}' is a change of a setting, no capture")
     if gpus is not None and gpus < 1:
         raise InputError(f"--gpus {gpus}: it must be at least 1")
-    if viewer is not None and len(viewer) > 1:
-        raise InputError(f"--viewer {' '.join(map(str, viewer))}: it takes one port")
     if viewer is not None and (gpus or 1) > 1:
         raise InputError(VIEWER_ON_ONE)
-    gc.disable()  # imports make a million objects and nothing to collect
     from turbogs_plugin.distributed.processes import joined, launched, restarted, start
     from turbogs_plugin.report.run_report import write_report
     from turbogs_plugin.report.tensorboard import event_writers
     from turbogs_plugin.train import run
 
-    gc.freeze()  # so that later collections pass over them
-    gc.enable()
     settings = options.settings(scene, overrides) if resume is None else run.RunFolder(resume).read_config()
     if resume and viewer is None and (finished := run.RunFolder(resume).finished_text(report)):
         print(finished)
@@ -109,12 +101,20 @@ def train(
     return code
 
 
-def plan(scene: Positional[Scene] = None, overrides: Overrides = (), /, *, options: Flat = NO_OPTIONS) -> int:
+def plan(
+    scene: Positional[Scene] = None,
+    overrides: Overrides = (),
+    /,
+    *,
+    gpus: Count = None,
+    options: Flat = NO_OPTIONS,
+) -> int:
     """Print what a run on a capture would decide, and why, without training; without a SCENE, every setting.
 
     Args:
         scene: capture as in train; where absent, the settings of the configuration are printed, each with its value.
         overrides: changes as in train; train.exposure=auto leaves a setting to the plan, any other value forces it.
+        gpus: number of GPUs that would train the model.
     """
     if scene is not None and is_change(scene):
         scene, overrides = None, (str(scene), *overrides)
@@ -126,7 +126,32 @@ def plan(scene: Positional[Scene] = None, overrides: Overrides = (), /, *, optio
         return 0
     from turbogs_plugin.train.run import plan_run
 
-    print(plan_run(settings, 1).text())
+    print(plan_run(settings, gpus or 1).text())
+    return 0
+
+
+def reconstruct(photos: Annotated[Positional[Path], arg(metavar="PHOTOS")], /, *, out: Path) -> int:
+    """Find the cameras of photos alone, and write a capture to train on. The same call goes on where it stopped.
+
+    Args:
+        photos: folder of at least three photos of one scene.
+        out: new folder for the capture, with images and sparse/0 (COLMAP).
+    """
+    from turbogs_plugin.reconstruct import reconstruct
+
+    print(reconstruct(photos, out).text())
+    return 0
+
+
+def demo(path: Positional[Path], /) -> int:
+    """Write a small synthetic capture to try things on: a textured scene as a COLMAP dataset.
+
+    Args:
+        path: new folder.
+    """
+    from turbogs_plugin.captures import write_demo_capture
+
+    print(f"capture  {write_demo_capture(path)}")
     return 0
 
 

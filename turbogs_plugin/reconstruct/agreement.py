@@ -27,8 +27,6 @@ WEAK = 1e-3
 """Weight of all other pairs: they decide where there is no other evidence."""
 POWER = 1.5
 """Exponent of the number of matches in a pair's weight: above 1, since pairs that see the same place have more."""
-DOUBT = 2.0
-"""Factor of contradicting matches by which a group becomes doubtful, and is named."""
 
 
 @dataclass(frozen=True)
@@ -52,17 +50,14 @@ class Agreement:
         return self.contradicting > self.agreeing
 
 
-def consistent_groups(agreement: Agreement, doubt: float = 1.0) -> list[list[int]]:
-    """Photos in groups that the matches hold together, the largest group first.
-
-    Args:
-        doubt: factor of contradicting matches. With 1, groups are apart where between them the contradicting matches
-            outweigh the agreeing ones.
+def consistent_groups(agreement: Agreement) -> list[list[int]]:
+    """Photos in groups that the matches hold together, the largest group first; between two groups the contradicting
+    matches outweigh the agreeing ones.
 
     Returns:
         Ascending indices of photos. All photos in one group: no majority contradicts the solve.
     """
-    weights = agreement.agreeing**POWER - doubt * agreement.contradicting**POWER
+    weights = agreement.agreeing**POWER - agreement.contradicting**POWER
     weights[~_strongest(agreement)] *= WEAK
     return _contracted(len(agreement.names), agreement.pairs, weights)
 

@@ -53,7 +53,7 @@ def choose_pairs(names: Sequence[str], positions: np.ndarray) -> tuple[np.ndarra
         reasons.append("in the order of their names")
     if not pairs:
         return every, "each with each, as neither names nor GPS say which are close"
-    return _distinct(np.concatenate(pairs)), " and ".join(reasons)
+    return np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0), " and ".join(reasons)
 
 
 def nearest_pairs(positions: np.ndarray) -> np.ndarray:
@@ -62,7 +62,7 @@ def nearest_pairs(positions: np.ndarray) -> np.ndarray:
     count = min(NEIGHBORS + 1, len(placed))
     _, nearest = cKDTree(positions[placed]).query(positions[placed], k=count)  # [., count]
     pairs = np.stack([np.repeat(placed, count), placed[nearest].ravel()], axis=1)
-    return _distinct(pairs[pairs[:, 0] != pairs[:, 1]])
+    return pairs[pairs[:, 0] != pairs[:, 1]]
 
 
 def metres_of(positions: np.ndarray) -> np.ndarray:
@@ -90,8 +90,3 @@ def are_ordered(names: Sequence[str]) -> bool:
         for first, second in pairwise(parts)
     ]
     return bool(follows) and sum(follows) >= ORDERED_SHARE * len(follows)
-
-
-def _distinct(pairs: np.ndarray) -> np.ndarray:
-    """Each pair once, the lower index first."""
-    return np.unique(np.sort(pairs.reshape(-1, 2), axis=1), axis=0)

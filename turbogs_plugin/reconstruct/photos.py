@@ -17,6 +17,7 @@ from PIL.ExifTags import IFD, Base
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, require_printable
 from turbogs_plugin.captures.decoding import decoding_threads, opened_image, require_8_bits
 from turbogs_plugin.captures.kinds import run_folder
+from turbogs_plugin.captures.mask_files import FOLDER, in_folders, require_mask_size
 from turbogs_plugin.captures.photo_files import find_photos, unread
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import naming
@@ -51,27 +52,6 @@ class PhotoFile:
     stamp: tuple[int, int]
 
 
-def list_photos(folder: Path) -> tuple[Path, list[Path]]:
-    """The folder that photos' names are relative to, and the photos in the order of their names.
-
-    Raises:
-        InputError: no folder, or a run's; fewer than `FEWEST_PHOTOS` photos.
-    """
-    reason = unread(folder)
-    if not folder.is_dir():
-        raise InputError(f"no such folder of photos: {folder}{f'; {reason}' if reason else ''}")
-    if where := run_folder(folder):
-        raise InputError(where)
-    place, paths = find_photos(folder)
-    if len(paths) < FEWEST_PHOTOS:
-        there = "no photos" if not paths else "1 photo" if len(paths) == 1 else f"{len(paths)} photos"
-        raise InputError(
-            f"{place if paths else folder} has {there}{f' ({reason})' if reason else ''}: at least {FEWEST_PHOTOS} are "
-            "needed, of one scene from different places"
-        )
-    return place, paths
-
-
 def plain_name(path: Path) -> str:
     """A relative path with ``/``, and with ``_`` for what COLMAP's lists take for separators."""
     return SEPARATORS.sub("_", path.as_posix())
@@ -81,9 +61,20 @@ def read_photos(folder: Path) -> list[PhotoFile]:
     """The photos of a folder, in the order of their names. Each is decoded once, coarsely.
 
     Raises:
-        InputError: as `list_photos`; names that a capture cannot have; or one that cannot be read (the first in order).
+        InputError: no folder, or a run's; fewer than `FEWEST_PHOTOS` photos; names that a capture cannot have; a photo
+            that cannot be read (the first in order).
     """
-    place, paths = list_photos(folder)
+    reason = f" ({text})" if (text := unread(folder)) else ""
+    if not folder.is_dir():
+        raise InputError(f"no such folder of photos: {folder}{reason}")
+    if where := run_folder(folder):
+        raise InputError(where)
+    place, paths = find_photos(folder)
+    if len(paths) < FEWEST_PHOTOS:
+        raise InputError(
+            f"{place if paths else folder} has {len(paths)} photos{reason}: at least {FEWEST_PHOTOS} are needed, of "
+            "one scene from different places"
+        )
     names = [plain_name(path.relative_to(place)) for path in paths]
     for name in names:
         require_printable(name, place)
@@ -117,6 +108,40 @@ def place_photos(photos: Sequence[PhotoFile], folder: Path) -> None:
 
     with decoding_threads() as pool:
         list(pool.map(place, photos))
+
+
+def place_masks(folder: Path, place: Path, photos: Sequence[PhotoFile], target: Path) -> None:
+    """Put the masks of photos, from a folder of masks in `folder`, in the photos' folder or beside it, into `target`.
+
+    A mask of the stored size of a photo that is not upright is turned as its photo is.
+
+    Args:
+        folder: as the user gave it.
+        place: folder that the photos' paths begin with.
+
+    Raises:
+        InputError: a mask that is no image, or has not its photo's size.
+    """
+    folders = [parent / FOLDER for parent in dict.fromkeys((folder, place.parent, place))]
+
+    def put(photo: PhotoFile) -> None:
+        path = in_folders(folders, photo.path.relative_to(place).as_posix())
+        if path is None:
+            return
+        with opened_image(path, "mask") as mask, opened_image(photo.path) as image:
+            require_mask_size(path, mask.size, photo.path, photo.size, image.size)
+            inside = path.relative_to(next(each for each in folders if each in path.parents))
+            file = target / plain_name(inside)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.unlink(missing_ok=True)
+            if photo.turned and mask.size == image.size:
+                mask.getexif()[Base.Orientation] = image.getexif()[Base.Orientation]
+                ImageOps.exif_transpose(mask).save(file, format=mask.format)
+            else:
+                link_or_copy(path, file)
+
+    with decoding_threads() as pool:
+        list(pool.map(put, photos))
 
 
 def link_or_copy(source: Path, target: Path) -> None:

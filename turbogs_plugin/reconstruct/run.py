@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from filelock import FileLock, Timeout
+from filelock import FileLock
 
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, named
 from turbogs_plugin.captures.colmap import load_pycolmap
-from turbogs_plugin.captures.decoding import photo_sizes, reduced_sizes
-from turbogs_plugin.captures.mask_files import misnamed
 from turbogs_plugin.captures.photo_files import find_photos, unread
-from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable, write_text_atomically
 from turbogs_plugin.reconstruct import solver
-from turbogs_plugin.reconstruct.agreement import (
-    DOUBT,
-    Agreement,
-    consistent_groups,
-    ghost_pairs,
-)
-from turbogs_plugin.reconstruct.masks import find_photo_masks, place_masks
+from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups, ghost_pairs
 from turbogs_plugin.reconstruct.matching import FEW, choose_pairs
-from turbogs_plugin.reconstruct.photos import PhotoFile, list_photos, place_photos, read_photos
+from turbogs_plugin.reconstruct.photos import PhotoFile, place_masks, place_photos, read_photos
 
 if TYPE_CHECKING:
     import pycolmap
@@ -77,13 +66,11 @@ class Solve:
 
     Args:
         model: the one with most photos.
-        sizes: photos of each model, the largest first.
         agreement: of all matches with the model.
         groups: photos that the matches put together, as indices into the agreement's names, the largest group first.
     """
 
     model: pycolmap.Reconstruction
-    sizes: tuple[int, ...]
     agreement: Agreement
     groups: list[list[int]]
 
@@ -104,41 +91,35 @@ class Solve:
 
 
 def reconstruct(photos: Path, out: Path) -> Solution:
-    """Find the cameras of photos, and write a COLMAP capture: ``images`` and ``sparse/0``.
+    """Find the cameras of photos, and write a COLMAP capture: ``images``, ``sparse/0`` and, where the photos have them,
+    ``masks``.
 
-    A call for photos of an earlier call that was stopped repeats no features and matches; a finished reconstruction is
-    told again. Masks of the photos go with them, as they are now.
+    A call for photos of an earlier call that was stopped repeats no finished step; a finished reconstruction is told
+    again. Masks are put in place at each call; a mask that is gone stays in the capture.
 
     Args:
         photos: a folder of photos, or a folder whose ``images`` are.
         out: the capture's folder, new or of an earlier call.
 
     Raises:
-        InputError: photos or folder are not usable, or the photos cannot be solved. Then what this call began is gone.
-        OSError: the disk is full; what was finished is kept.
+        InputError: photos or folder are not usable, or the photos cannot be solved. Then a new folder `out` is gone.
     """
-    load_pycolmap()  # where it is absent, that is said before photos are read
+    load_pycolmap()  # an absent package is told before photos are read
     found = read_photos(photos)
     place, _ = find_photos(photos)
     if place.resolve() in (out.resolve(), *out.resolve().parents):
         raise InputError(f"the scene '{out}' would lie among the photos of '{place}': choose an --out elsewhere")
-    masks = find_photo_masks(photos, place, found)
-    missing = [parent for parent in (out, *out.parents) if not parent.exists()]
-    scratch = out / "reconstruction"
-    new = _begin(found, out, scratch / "photos.json")
-    unused = "" if masks else misnamed(dict.fromkeys((photos, place.parent, place)))
-    solution = _read_solution(out)
-    with _held(scratch) if solution is None else nullcontext():  # a finished one may lie where nothing can be written
-        place_masks(masks, out / "masks", scratch / "masks.txt")
-        try:
-            solution = solution or _reconstruct(found, out, unread(photos))
-        except InputError:
-            if new:
-                shutil.rmtree(missing[-1] if missing else scratch, ignore_errors=True)
-                for folder in (out / "images", out / "masks"):
-                    shutil.rmtree(folder, ignore_errors=True)
-            raise
-    return replace(solution, notes=[*solution.notes, unused]) if unused else solution
+    new = _begin(found, out)
+    try:
+        place_masks(photos, place, found, out / "masks")
+        if solution := _read_solution(out):
+            return solution
+        with FileLock(out / "reconstruction" / "lock"):  # freed by the system where a process is killed
+            return _read_solution(out) or _reconstruct(found, out, unread(photos))
+    except InputError:
+        if new:
+            shutil.rmtree(out)
+        raise
 
 
 def scene_beside(photos: Path, run: Path) -> Path:
@@ -148,28 +129,25 @@ def scene_beside(photos: Path, run: Path) -> Path:
     return run.absolute().parent / f"{name}-scene"
 
 
-def reconstruct_beside(config: Config, run: Path) -> Path:
-    """Find the cameras of a capture of photos alone (`holds_photos_alone`) for a run; folder of the reconstruction.
+def reconstruct_beside(photos: Path, run: Path) -> Path:
+    """Find the cameras of a folder of photos alone (`holds_photos_alone`) for a run; folder of the reconstruction.
 
     Raises:
-        InputError: the photos cannot be solved, or are too small for the factor.
+        InputError: as `reconstruct`.
     """
-    photos = Path(config.scene.path)
-    _, paths = list_photos(photos)  # too few are refused before anything is said
-    if config.scene.factor > 1:
-        reduced_sizes(photo_sizes(paths), config.scene.factor)  # as is a factor that is too large
     scene = scene_beside(photos, run)
     print(f"{photos} has photos alone: their cameras are found first, into {scene}", file=sys.stderr, flush=True)
     print("\n".join(reconstruct(photos, scene).notes), file=sys.stderr, flush=True)
     return scene
 
 
-def _begin(photos: Sequence[PhotoFile], out: Path, listed: Path) -> bool:
+def _begin(photos: Sequence[PhotoFile], out: Path) -> bool:
     """Make the folder of a scene and list its photos, or see that an earlier call listed them, too; whether it is new.
 
     Raises:
         InputError: the folder holds something else, or a reconstruction of other photos.
     """
+    listed = out / "reconstruction" / "photos.json"
     text = json.dumps({photo.name: photo.stamp for photo in photos}, indent=1)
     known = read_text(listed)
     if known is not None and known != text:
@@ -183,64 +161,46 @@ def _begin(photos: Sequence[PhotoFile], out: Path, listed: Path) -> bool:
     return known is None
 
 
-@contextmanager
-def _held(scratch: Path) -> Iterator[None]:
-    """While entered, no other process makes the scene; the system frees the lock of a process that is killed."""
-    try:
-        lock = FileLock(scratch / "lock", blocking=False).acquire()
-    except Timeout:
-        raise InputError(f"'{scratch.parent}' is being made by another process: wait for it") from None
-    with lock:
-        yield
-
-
 def _read_solution(out: Path) -> Solution | None:
     """What an earlier call came to; None where none was finished."""
     text = read_text(out / "reconstruction" / "solution.json")
-    try:
-        return Solution(out, **json.loads(text)) if text and (out / "sparse" / "0").is_dir() else None
-    except (ValueError, TypeError):  # it is damaged: made anew
-        return None
+    return Solution(out, **json.loads(text)) if text and (out / "sparse" / "0").is_dir() else None
 
 
 def _reconstruct(photos: Sequence[PhotoFile], out: Path, others: str) -> Solution:
     """Solve the photos and write the scene. `others`: files beside the photos that are not read, for a note."""
-    scratch, images = out / "reconstruction", out / "images"
+    scratch, images, names = out / "reconstruction", out / "images", [photo.name for photo in photos]
     images.mkdir(exist_ok=True)
     place_photos(photos, images)
-    names = [photo.name for photo in photos]
     enough = len(photos) if len(photos) <= FEW else ENOUGH_OF_MANY * len(photos)
     best: Solve | None = None
-    moved, said = [], "no photo shows anything that could be found again in another one: take sharp photos with texture"
+    moved: list[str] = []
     small = max(max(photo.size) for photo in photos) < SMALL
     for doubled in (True,) if small else (False, True):
         database = scratch / f"features{'-doubled' * doubled}.db"
         solver.extract_features(database, images, photos, doubled)
-        if not solver.count_features(database):
-            continue
         pairs, reason = choose_pairs(names, solver.read_positions(database, names))
         solver.match_features(database, scratch, [(names[first], names[second]) for first, second in pairs.tolist()])
-        matched = solver.count_verified_pairs(database)
-        said = f"{matched:,} of {len(pairs):,} pairs of photos match"
         solve, repaired = _solve(database, images, scratch)
         if solve is not None and (best is None or solve.rank > best.rank):
             best, moved = solve, repaired
-            note = f"{_photos(len(photos))} matched {reason}: {matched:,} pairs show the same"
         if best is not None and best.placed >= enough:
             break
-    if best is None:
-        raise InputError(f"no cameras were found for {len(photos)} photos: {said}; {REMEDY}")
-    if best.placed < max(FEWEST_PHOTOS, SMALLEST_SHARE * len(photos)):
-        sizes = ", ".join(map(str, best.sizes[:NAMED_AT_MOST]))
-        raise InputError(f"only {best.placed} of {len(photos)} photos connect (models of {sizes} photos): {REMEDY}")
+    if best is None or best.placed < max(FEWEST_PHOTOS, SMALLEST_SHARE * len(photos)):
+        placed = best.placed if best else 0
+        raise InputError(f"cameras were found for only {placed} of {len(photos)} photos: {REMEDY}")
     model, ghosts = best.model, set(best.ghosts)
     for frame in {image.frame_id for image in model.images.values() if image.name in ghosts}:
         model.deregister_frame(frame)
     registered = {image.name for image in model.images.values() if image.has_pose}
     left_out = [name for name in names if name not in registered]
     notes = [f"not used: {others}"] if others else []
-    notes += [note, *_notes(best, len(photos), moved, left_out)]
-    _write_model(model, out / "sparse", scratch)
+    notes += [f"{len(photos)} photos matched {reason}", *_notes(best, len(photos), moved, left_out)]
+    for folder in (scratch / "sparse", out / "sparse", scratch / "models"):
+        shutil.rmtree(folder, ignore_errors=True)
+    (scratch / "sparse" / "0").mkdir(parents=True)
+    model.write_binary(scratch / "sparse" / "0")
+    (scratch / "sparse").rename(out / "sparse")  # whole or not at all
     result = Solution(out, len(photos), len(registered), model.num_points3D(), left_out, notes)
     kept = {name: value for name, value in asdict(result).items() if name != "scene"}  # which may be moved
     write_text_atomically(scratch / "solution.json", json.dumps(kept, indent=1))
@@ -270,48 +230,23 @@ def _attempt(database: Path, evidence: Path, images: Path, scratch: Path) -> Sol
     if not models or models[0].num_reg_images() < FEWEST_PHOTOS:
         return None
     agreement = solver.measure_agreement(models[0], evidence)
-    sizes = tuple(model.num_reg_images() for model in models)
-    return Solve(models[0], sizes, agreement, consistent_groups(agreement))
-
-
-def _write_model(model: pycolmap.Reconstruction, sparse: Path, scratch: Path) -> None:
-    """Put the model in place, whole or not at all. Raises `OSError` where the disk is full, of which pycolmap says
-    nothing."""
-    part = scratch / "sparse"
-    for folder in (part, sparse, scratch / "models"):
-        shutil.rmtree(folder, ignore_errors=True)
-    (part / "0").mkdir(parents=True)
-    try:
-        model.write_binary(part / "0")
-        whole = load_pycolmap().Reconstruction(part / "0").num_points3D() == model.num_points3D()
-    except (RuntimeError, ValueError, IndexError):  # of a file that was cut
-        whole = False
-    if not whole:
-        raise OSError(errno.ENOSPC, "it cannot be written whole", str(sparse))
-    part.rename(sparse)
+    return Solve(models[0], agreement, consistent_groups(agreement))
 
 
 def _notes(solve: Solve, photos: int, moved: list[str], left_out: list[str]) -> list[str]:
     """Lines for the user about a solve."""
-    model, agreement = solve.model, solve.agreement
-    error = model.compute_mean_reprojection_error()
     notes = [
-        f"{photos - len(left_out)} of {photos} photos registered, {model.num_points3D():,} points, reprojection error "
-        f"{error:.2f} px"
+        f"{photos - len(left_out)} of {photos} photos registered, {solve.model.num_points3D():,} points, reprojection "
+        f"error {solve.model.compute_mean_reprojection_error():.2f} px"
     ]
-    placed = {agreement.names[view] for view in solve.groups[0]}
-    doubtful = [agreement.names[view] for group in consistent_groups(agreement, DOUBT)[1:] for view in group]
     unplaced = [name for name in left_out if name not in solve.ghosts]
     for names, said in (
         (moved, "moved, as repeated structure misled the first solve: solved again without the pairs that did"),
         (solve.ghosts, "left out, as more matches contradict their place than confirm it (repeated structure)"),
         (unplaced, "did not register: add photos between them and the others"),
-        ([name for name in doubtful if name in placed], "may be in a wrong place, which many matches contradict"),
     ):
         if names:
-            notes.append(f"{_photos(len(names))} {said}: {named(names, most=NAMED_AT_MOST)}")
+            notes.append(
+                f"{len(names)} {'photo' if len(names) == 1 else 'photos'} {said}: {named(names, most=NAMED_AT_MOST)}"
+            )
     return notes
-
-
-def _photos(count: int) -> str:
-    return f"{count} photo{'s' * (count != 1)}"

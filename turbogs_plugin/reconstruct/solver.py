@@ -37,13 +37,19 @@ BLOCK = 128
 
 
 def extract_features(database: Path, images: Path, photos: Sequence[PhotoFile], doubled: bool) -> None:
-    """SIFT features of all photos into the database, one camera for each lens; photos that have them are left alone.
+    """SIFT features of all photos into the database, one camera for each lens. A database that has all photos stays;
+    another one, of a call that was stopped, is made anew.
 
     Args:
         doubled: look for features at twice the size, too, as COLMAP does by default: two to three times as many in
             three times the time.
     """
     pycolmap = _pycolmap()
+    if database.is_file():
+        with pycolmap.Database.open(database) as opened:
+            if opened.num_images() == len(photos):
+                return
+        database.unlink()
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size, options.num_threads = LONG_SIDE, torch.get_num_threads()
     options.sift.first_octave = -1 if doubled else 0
@@ -54,8 +60,6 @@ def extract_features(database: Path, images: Path, photos: Sequence[PhotoFile], 
         for names in lenses.values():
             reader = pycolmap.ImageReaderOptions()
             reader.camera_model = "OPENCV" if len(names) >= MANY else DEFAULT_MODEL
-            if known := _cameras(database, names):  # of an earlier call that was stopped
-                reader.existing_camera_id = known[0]
             pycolmap.extract_features(
                 database,
                 images,
@@ -158,12 +162,6 @@ def without_pairs(database: Path, copy: Path, pairs: Sequence[tuple[str, str]]) 
             opened.delete_two_view_geometry(numbers[first], numbers[second])
 
 
-def count_features(database: Path) -> int:
-    """Number of features of all photos."""
-    with _pycolmap().Database.open(database) as opened:
-        return opened.num_keypoints()
-
-
 def read_positions(database: Path, names: Sequence[str]) -> np.ndarray:
     """[V, 2] degrees of latitude and longitude by the photos' GPS; NaN where a photo has none."""
     pycolmap = _pycolmap()
@@ -176,13 +174,6 @@ def read_positions(database: Path, names: Sequence[str]) -> np.ndarray:
             if name in names and prior.coordinate_system == pycolmap.PosePriorCoordinateSystem.WGS84 and place.any():
                 positions[names.index(name)] = place
     return positions
-
-
-def count_verified_pairs(database: Path) -> int:
-    """Number of pairs of photos with matches that one geometry explains."""
-    with _pycolmap().Database.open(database) as opened:
-        _, inliers = opened.read_two_view_geometry_num_inliers()
-    return int((np.array(inliers) > 0).sum())
 
 
 def _pycolmap() -> ModuleType:
@@ -199,14 +190,6 @@ def _told(step: str) -> Iterator[None]:
     started = time.monotonic()
     yield
     print(f"{step}: {time.monotonic() - started:.1f} s", file=sys.stderr, flush=True)
-
-
-def _cameras(database: Path, names: Sequence[str]) -> list[int]:
-    """Numbers of the cameras that these photos have already."""
-    if not database.is_file():
-        return []
-    with _pycolmap().Database.open(database) as opened:
-        return sorted({image.camera_id for image in opened.read_all_images() if image.name in names})
 
 
 def _rays(camera: pycolmap.Camera, keypoints: np.ndarray) -> np.ndarray:

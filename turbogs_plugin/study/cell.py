@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import replace
 
 import numpy as np
 import torch
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import with_iterations
-from turbogs_plugin.device import free_device_memory, peak_memory_bytes
+from turbogs_plugin.device import free_device_memory
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.study.results import CellResult, changes, curve_and_final, flat_settings, measured
 from turbogs_plugin.train.clock import WallClock
-from turbogs_plugin.train.loop import Listener, TrainingLoop
+from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.metrics import Evaluations, evaluate
 from turbogs_plugin.train.perceptual import load_flip, load_lpips
 from turbogs_plugin.train.run import new_loop
@@ -29,51 +28,13 @@ WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
 the code of every kind of step is loaded. One for a variant and capture in each process: what is loaded stays."""
 
 
-class PeakMemory(Listener):
-    """Peak of the GPU's tensors while training, without what evaluations need; nothing on a CPU.
-
-    One process trains all cells, so a CPU's peak, which is the process's, would be the largest cell's so far.
-
-    Attributes:
-        peak: bytes; None on a CPU.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
-        self.peak: int | None = None
-        self.evaluated()
-
-    def evaluating(self, loop: TrainingLoop) -> None:
-        if self.device.type == "cuda":
-            self.peak = max(self.peak or 0, torch.cuda.max_memory_allocated(self.device))
-
-    def evaluated(self, *told: object) -> None:
-        if self.device.type == "cuda":
-            torch.cuda.reset_peak_memory_stats(self.device)
-
-
 def capture_digest(scene: Scene) -> str:
-    """Digest that tells captures of one name apart: photos' names, sizes, cameras, unmasked pixels; number of points.
-
-    Pixels are not in it, for decoders of different versions give different ones. Cameras' coordinates count by four
-    digits of a sum, for the last bits differ from machine to machine.
-    """
+    """Digest that tells captures of one name apart: names and sizes of the photos, and the number of points."""
     digest = hashlib.sha256(str(len(scene.points)).encode())
     for part in (scene.train, scene.test):
         digest.update("\n".join(("", *part.names)).encode())
         digest.update(np.ascontiguousarray(part.cameras.sizes, dtype="<i8").tobytes())
-        for array in (part.cameras.viewmats, part.cameras.Ks):
-            values = array.cpu().double().abs().flatten()
-            places = torch.linspace(1.0, 2.0, len(values), dtype=torch.float64)  # so that their order counts
-            digest.update(f"{float(values @ places):.4g}".encode())
-        if part.masks is not None:
-            digest.update(np.ascontiguousarray(part.masks.pixel_counts, dtype="<i8").tobytes())
     return digest.hexdigest()[:16]
-
-
-def scene_on(scene: Scene, device: torch.device) -> Scene:
-    """The scene with its photos on the device, for what is timed without a plan."""
-    return replace(scene, train=scene.train.to(device), test=scene.test.to(device))
 
 
 def train_cell(
@@ -109,20 +70,22 @@ def train_cell(
     if not warm:
         warm_up(planned, scene, test, device)
     clock.mark("warm-up")
-    memory = PeakMemory(device)
     loop = new_loop(planned, scene, device)
-    evaluations = Evaluations(test, lpips, lambda: memory.peak or peak_memory_bytes(device))
-    loop.listeners = [evaluations, memory]  # in this order, so that the peak forgets what evaluations needed
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    evaluations = Evaluations(test)
+    loop.listeners = [evaluations]
     loop.run()
     clock.mark("cell")
-    trainer, mean_flip = loop.trainer, math.nan
-    if flip is not None:  # off the clock
-        mean_flip = evaluate(trainer.gaussians, test, trainer.look(test.names), flip=flip).mean.flip
-    curve, final = curve_and_final(evaluations.history)
+    trainer, (curve, final) = loop.trainer, curve_and_final(evaluations.history)
     if evaluations.metrics is not None:
-        final["lpips"], final["fps"] = evaluations.metrics.mean.lpips, evaluations.metrics.fps
-    final["flip"], final["cell_seconds"] = mean_flip, loading + clock.parts["cell"]
-    final["peak_mib"] = math.nan if memory.peak is None else memory.peak / 2**20
+        final["fps"] = evaluations.metrics.fps
+    final["cell_seconds"] = loading + clock.parts["cell"]
+    if device.type == "cuda":  # a CPU's peak is the process's, of the largest cell so far
+        final["peak_mib"] = evaluations.history[-1].memory_bytes / 2**20
+    if lpips is not None or flip is not None:  # off the clock
+        mean = evaluate(trainer.gaussians, test, trainer.look(test.names), lpips=lpips, flip=flip).mean
+        final["lpips"], final["flip"] = mean.lpips, mean.flip
     settings = flat_settings(config.to_mapping())
     return CellResult(
         scene=scene.name,

@@ -79,26 +79,16 @@ class CellResult:
 
 
 @dataclass
-class Failure:
-    """A cell that gave no result, and why."""
-
-    key: CellKey
-    reason: str
-
-
-@dataclass
 class Study:
     """An ablation with the results of its cells.
 
     Args:
         ablation: title, variants, baseline.
         results: finished cells: captures in the order of their names, variants in the ablation's, seeds ascending.
-        failures: broken cells.
     """
 
     ablation: Ablation
     results: list[CellResult]
-    failures: list[Failure] = field(default_factory=list)
 
     @property
     def scenes(self) -> list[str]:
@@ -163,28 +153,17 @@ class StudyFolder:
 
     def require_usable(self) -> None:
         """Raise `InputError` where the folder holds anything but a study, or cannot be one."""
-        if self.path.exists() and not self.path.is_dir():
-            raise InputError(f"--out '{self.path}' is a file: choose a folder")
-        if self.path.is_dir() and any(self.path.iterdir()) and not self.file.is_file():
+        taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
+        if taken and not self.file.is_file():
             raise InputError(f"--out '{self.path}' is not empty and holds no study: choose a new folder")
 
-    def write(self, outcome: CellResult | Failure) -> None:
-        """Keep a cell's result, or the reason why there is none, as a study of that cell alone."""
-        path = self.cells / outcome.key.file
+    def write(self, result: CellResult) -> None:
+        """Keep a cell's result, as a study of that cell alone."""
+        path = self.cells / result.key.file
         path.parent.mkdir(parents=True, exist_ok=True)
-        ablation = Ablation(title=str(outcome.key), variants={outcome.key.variant: []})
-        study = Study(ablation, [], [outcome]) if isinstance(outcome, Failure) else Study(ablation, [outcome])
-        write_text_atomically(path, _text(study))
-
-    def ended(self, key: CellKey) -> bool:
-        """Whether a cell has a file: a result or a failure."""
-        return (self.cells / key.file).is_file()
-
-    def forget_failures(self) -> None:
-        """Remove the files of broken cells, so that they are trained again."""
-        for path in self.cells.glob("*/*.json"):
-            if _parsed(path).failures:
-                path.unlink(missing_ok=True)
+        write_text_atomically(
+            path, _text(Study(Ablation(title=str(result.key), variants={result.variant: []}), [result]))
+        )
 
     @contextmanager
     def claimed(self, key: CellKey) -> Iterator[bool]:
@@ -218,13 +197,12 @@ class StudyFolder:
         study = _parsed(self.file)
         parts = [study, *(_parsed(path) for path in self.cells.glob("*/*.json"))]
         found = {result.key: result for part in parts for result in part.results}
-        broken = {failure.key: failure for part in parts for failure in part.failures}
         order = {name: number for number, name in enumerate(study.ablation.variants)}
         for key in found:
             if key.variant not in order:
                 raise InputError(f"'{self.path}' has a cell of another ablation ({key}): choose a new --out")
         results = sorted(found.values(), key=lambda result: (result.scene, order[result.variant], result.seed))
-        return Study(study.ablation, results, [failure for key, failure in broken.items() if key not in found])
+        return Study(study.ablation, results)
 
 
 def _text(study: Study) -> str:
@@ -234,7 +212,6 @@ def _text(study: Study) -> str:
     document: dict[str, Any] = {"format": FORMAT, **asdict(study.ablation)}
     document["provenances"] = [entry and asdict(entry) for entry in provenances]
     document["settings"] = common
-    document["failures"] = [{**asdict(failure.key), "reason": failure.reason} for failure in study.failures]
     lines = [f"{json.dumps(name)}: {json.dumps(value, ensure_ascii=False)}" for name, value in document.items()]
     cells = []
     for result in study.results:
@@ -268,19 +245,13 @@ def _parsed(path: Path) -> Study:
             raise InputError(said)
         ablation = Ablation(**{entry.name: document[entry.name] for entry in fields(Ablation)})
         provenances = [entry and Provenance(**entry) for entry in document["provenances"]]
-        failures = [
-            Failure(CellKey(entry["scene"], entry["variant"], entry["seed"]), entry["reason"])
-            for entry in document["failures"]
-        ]
         results = [_result(entry, document["settings"], provenances) for entry in document["cells"]]
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise InputError(f"'{path}' does not hold results of a study ({error!r}): choose a new --out") from None
-    return Study(ablation, results, failures)
+    return Study(ablation, results)
 
 
 def _result(entry: dict[str, Any], common: dict[str, Any], provenances: Sequence[Provenance | None]) -> CellResult:
     result = CellResult(**entry | {"provenance": provenances[entry["provenance"]]})
     curve = {name: [math.nan if value is None else value for value in result.curve[name]] for name in CURVE}
-    if not curve["seconds"] or {len(column) for column in curve.values()} != {len(curve["seconds"])}:
-        raise TypeError(f"curve of {result.key}: columns of one length are needed")
     return replace(result, settings=with_changes(common, result.settings), curve=curve)

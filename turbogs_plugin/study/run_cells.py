@@ -11,7 +11,6 @@ import multiprocessing
 import os
 import sys
 import time
-import traceback
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -23,19 +22,16 @@ import torch
 
 from turbogs_plugin.captures.camera_refinement import load_and_find, with_cameras
 from turbogs_plugin.config.configuration import Config
-from turbogs_plugin.device import free_device_memory, processor_cores, synchronize
+from turbogs_plugin.device import free_device_memory, processor_cores
 from turbogs_plugin.distributed.processes import end_with_parent
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import Provenance, provenance
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
-from turbogs_plugin.study.results import CellResult, Failure, Study, StudyFolder, changes, flat_settings
+from turbogs_plugin.study.results import Study, StudyFolder, changes, flat_settings
 from turbogs_plugin.study.study_report import write_report
 from turbogs_plugin.train.inputs import resolve_device
-
-POLL_SECONDS = 1.0
-"""Time between two looks at cells that other processes train."""
 
 OF_A_CALL = ("train.device", "train.batch_for", "report.")
 """Beginnings of settings that may differ between a kept cell and a later call: they change no result."""
@@ -70,9 +66,8 @@ class CellChoice:
         paths = [path.resolve() for path in self.scenes]
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
             raise InputError(f"seeds: one or more different ones are needed, got {list(self.seeds)}")
-        for first, second in itertools.combinations(paths, 2):
-            if first.name == second.name:
-                raise InputError(f"scenes: two folders are called '{first.name}', {first} and {second}: rename one")
+        if len({path.name for path in paths}) < len(paths):
+            raise InputError(f"scenes: two folders of {', '.join(map(str, paths))} are called the same: rename one")
         for path in paths:
             if not path.is_dir():
                 raise InputError(f"no such scene: '{path}': give --scene the folder of a capture")
@@ -87,92 +82,70 @@ class CellChoice:
         return configs
 
 
-def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | None = None) -> list[Failure]:
-    """Train the cells that a study's folder has not yet, and write its report; the cells that broke.
+def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | None = None) -> list[str]:
+    """Train the cells that a study's folder has not yet, and write its report; a line for each cell that broke.
 
-    A cell that breaks is kept as a failure and the others go on; the next call tries it again. The report is written
-    where the call is interrupted, too, of what is there.
+    A cell that breaks leaves no file and the others go on; the next call tries it again. The report is written where
+    the call is interrupted, too, of what is there.
 
     Args:
         gpus: number of this machine's GPUs, a process each; None: this process trains.
 
     Raises:
         InputError: anything wrong with the input (then nothing was trained), or a cell made with other settings.
-        TrainingStopped: no process can go on.
+        TrainingStopped: a process was killed.
     """
     folder = StudyFolder(out)
     folder.require_usable()
     configs = choice.configs(ablation)
-    if folder.file.is_file():
-        folder.forget_failures()
-        _require_same_settings(folder, configs)
+    study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
+    _require_same_settings(study, configs)
+    folder.write_study(Study(ablation, study.results))
     here = provenance(resolve_device(choice.device).type)
     try:
         if gpus is None:
-            train_cells(ablation, choice, folder, here)
-        else:
-            _train_on_gpus(gpus, (ablation, choice, folder, here))
+            return train_cells(ablation, choice, folder, here)
+        return _train_on_gpus(gpus, (ablation, choice, folder, here))
     finally:
-        study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
-        if study.results:
+        if folder.read_study().results:
             print(f"report  {write_report(folder)}")
-    return study.failures
 
 
-def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, here: Provenance) -> None:
-    """Train, in this process, the cells that the folder has not and no other process trains, until all are there.
+def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, here: Provenance) -> list[str]:
+    """Train, in this process, the cells that the folder has not and no other process trains; what broke.
 
     Args:
         here: machine and sources, as they were when the call began.
 
     Raises:
         InputError: a capture cannot be read, or is another one than the finished cells'.
-        TrainingStopped: the GPU no longer answers this process.
     """
     device, configs = resolve_device(choice.device), choice.configs(ablation)
-    finished = {result.key: result for result in folder.read_study().results} if folder.file.is_file() else {}
-    folder.write_study(Study(ablation, list(finished.values())))
-    left = {key: config for key, config in configs.items() if key not in finished}
-    if len(left) < len(configs):
-        _say(f"{len(configs) - len(left)} finished cells are kept")
     warm: set[tuple[str, str]] = set()  # variants and captures
-    total, done, spent = len(left), 0, 0.0
-    while left:
-        waiting = True
-        for key, config in list(left.items()):
-            with folder.claimed(key) as mine:
-                if not mine:
-                    continue
-                del left[key]
-                waiting = False
-                if folder.ended(key):  # another process has trained it
-                    total -= 1
-                    continue
-                given = config.scene
-                scene, digest, loading = _loaded(
-                    given.path, given.factor, given.test_every, config.train.refine_cameras
-                )
-                if any(cell.scene == key.scene and cell.capture not in ("", digest) for cell in finished.values()):
-                    raise InputError(
-                        f"'{key.scene}' has other photos or cameras than its kept cells: choose a new --out"
-                    )
-                started = time.perf_counter()
-                try:
-                    outcome: CellResult | Failure = train_cell(
-                        key.variant, config, scene, device, here, loading, (key.variant, key.scene) in warm
-                    )
-                    warm.add((key.variant, key.scene))
-                except Exception as error:  # whatever a variant breaks by, the other cells go on
-                    outcome = Failure(key, _reason(error))
-                folder.write(outcome)
-            done, spent = done + 1, spent + time.perf_counter() - started
-            seconds = round(spent / done * (total - done))
-            said = f"FAILED: {outcome.reason}" if isinstance(outcome, Failure) else outcome.text()
-            _say(f"[{done}/{total}] {key}: {said}; about {seconds // 60} min {seconds % 60:02d} s left")
-            if isinstance(outcome, Failure):
-                _require_working(device)
-        if waiting:
-            time.sleep(POLL_SECONDS)
+    broken: list[str] = []
+    for number, (key, config) in enumerate(configs.items(), 1):
+        with folder.claimed(key) as mine:
+            kept = {result.key: result for result in folder.read_study().results}
+            if not mine or key in kept:
+                continue
+            given = config.scene
+            scene, digest, loading = _loaded(given.path, given.factor, given.test_every, config.train.refine_cameras)
+            if any(cell.scene == key.scene and cell.capture not in ("", digest) for cell in kept.values()):
+                raise InputError(f"'{key.scene}' has other photos than its kept cells: choose a new --out")
+            try:
+                free_device_memory(device)  # memory of a cell that broke
+                is_warm = (key.variant, key.scene) in warm
+                result = train_cell(key.variant, config, scene, device, here, loading, is_warm)
+            except Exception as error:  # whatever a variant breaks by, the other cells go on
+                broken.append(f"{key}: {type(error).__name__}: {' '.join(str(error).split())}")
+                said = f"FAILED {broken[-1]}"
+            else:
+                warm.add((key.variant, key.scene))
+                folder.write(result)
+                said = f"{key}: {result.text()}"
+            # One write with the end of the line, or the lines of two processes would stand on one.
+            print(f"[{number}/{len(configs)}] {said}\n", end="", file=sys.stderr, flush=True)
+    return broken
 
 
 @lru_cache(maxsize=2)  # with refined cameras and without
@@ -184,24 +157,8 @@ def _loaded(path: str, factor: int, test_every: int, refined: bool) -> tuple[Sce
     return own, capture_digest(scene), time.perf_counter() - started
 
 
-def _reason(error: Exception) -> str:
-    """One line: what happened, and where unless the message is for the user."""
-    text = " ".join(str(error).split()) or "no message"
-    if isinstance(error, InputError | TrainingStopped):
-        return text
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{type(error).__name__}: {text[:500]} ({Path(frame.filename).name}:{frame.lineno})"
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(f"{text}\n")  # with its end, or the lines of two processes would stand on one
-    sys.stderr.flush()
-
-
-def _require_same_settings(folder: StudyFolder, configs: dict[CellKey, Config]) -> None:
-    for result in folder.read_study().results:
-        if result.key not in configs:
-            continue
+def _require_same_settings(study: Study, configs: dict[CellKey, Config]) -> None:
+    for result in (result for result in study.results if result.key in configs):
         asked = flat_settings(configs[result.key].to_mapping())
         changed = [path for path in changes(asked, result.settings) if not path.startswith(OF_A_CALL)]
         if changed:
@@ -210,34 +167,19 @@ def _require_same_settings(folder: StudyFolder, configs: dict[CellKey, Config]) 
             )
 
 
-def _require_working(device: torch.device) -> None:
-    """After a failure: see whether the GPU still answers this process, and free the broken model's memory."""
-    try:
-        synchronize(device)
-    except RuntimeError as error:
-        reason = str(error).splitlines()[0]
-        raise TrainingStopped(f"the GPU no longer answers this process ({reason}): call again to go on") from None
-    free_device_memory(device)
-
-
-def _train_on_gpus(gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder, Provenance]) -> None:
+def _train_on_gpus(gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder, Provenance]) -> list[str]:
     """`train_cells` by a process for each GPU."""
     if arguments[1].device != "cpu" and gpus > torch.cuda.device_count():
         raise InputError(f"--gpus {gpus}: this machine has {torch.cuda.device_count()}; see 'turbogs doctor'")
     try:
         with ProcessPoolExecutor(gpus, multiprocessing.get_context("spawn")) as pool:
-            try:
-                for worker in [pool.submit(_work, gpu, gpus, arguments) for gpu in range(gpus)]:
-                    worker.result()
-            except KeyboardInterrupt:
-                for process in multiprocessing.active_children():
-                    process.terminate()
-                raise
+            workers = [pool.submit(_work, gpu, gpus, arguments) for gpu in range(gpus)]
+            return [line for worker in workers for line in worker.result()]
     except BrokenProcessPool:
         raise TrainingStopped("a process of this study was killed: call again to go on") from None
 
 
-def _work(gpu: int, gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder, Provenance]) -> None:
+def _work(gpu: int, gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder, Provenance]) -> list[str]:
     """Task of a process, before it starts CUDA. It ends with the process that started it."""
     parent = multiprocessing.parent_process()
     end_with_parent(lambda: parent is not None and parent.is_alive())
@@ -245,4 +187,4 @@ def _work(gpu: int, gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolde
     os.environ["CUDA_VISIBLE_DEVICES"] = visible[gpu] if gpu < len(visible) else str(gpu)
     # With as many threads as cores in each process, all would wait for one another at every parallel loop.
     torch.set_num_threads(max(1, processor_cores() // gpus))
-    train_cells(*arguments)
+    return train_cells(*arguments)

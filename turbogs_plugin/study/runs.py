@@ -57,7 +57,6 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
             planned=changes(settings, flat_settings(config.to_mapping())),
             curve=curve,
             final=final,
-            lpips_reason="a run's history does not record it; see the runs' own reports",
         )
         for other_path, other in zip(paths, results, strict=False):
             if other.key == result.key:

@@ -67,7 +67,7 @@ class Difference:
         mean, error = first.mean - second.mean, math.hypot(first.standard_error, second.standard_error)
         if min(first.count, second.count) < FEWEST_SEEDS or math.isnan(mean):
             return cls(mean, error, None)
-        if error == 0.0:  # of which the test knows nothing
+        if error == 0.0:  # the test divides by it
             return cls(mean, error, mean != 0.0)
         return cls(mean, error, bool(ttest_ind(own, base, equal_var=False).pvalue < NOISE))
 

@@ -1,4 +1,4 @@
-"""Report of a study: ``report.md`` with tables for each capture, and two plots."""
+"""Report of a study: ``report.md`` with tables for each capture, and a plot."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.report.tables import table
 from turbogs_plugin.study.results import Study, StudyFolder
 from turbogs_plugin.study.statistics import Difference, SceneSummary, Spread, VariantRow, summarise
-from turbogs_plugin.study.study_plots import PLOTS, write_plots
+from turbogs_plugin.study.study_plots import PLOT, write_plot
 
 MEASURES = {
     "seconds": ("training in s", 2),
@@ -42,7 +42,7 @@ HOW_TO_READ = (
 
 
 def write_report(folder: StudyFolder, targets: Sequence[float] = ()) -> Path:
-    """Write ``results.json`` of everything in the folder, and from it the plots and the page; the page.
+    """Write ``results.json`` of everything in the folder, and from it the plot and the page; the page.
 
     Args:
         targets: PSNRs in dB whose time is asked for; where empty they follow from the baseline's result.
@@ -50,7 +50,7 @@ def write_report(folder: StudyFolder, targets: Sequence[float] = ()) -> Path:
     folder.write_study(folder.read_study())
     study = folder.read_study()  # with the digits that the file keeps
     summaries = summarise(study, targets)
-    write_plots(folder.path, summaries)
+    write_plot(folder.path, summaries)
     page = folder.path / "report.md"
     write_text_atomically(page, report_text(study, summaries))
     return page
@@ -61,15 +61,11 @@ def report_text(study: Study, summaries: Sequence[SceneSummary]) -> str:
     reasons = dict.fromkeys(result.lpips_reason for result in study.results if result.lpips_reason)
     said = [HOW_TO_READ, *(f"LPIPS was not computed: {reason}." for reason in reasons)]
     parts = [f"# {study.ablation.title}", *(textwrap.fill(text, 120, break_on_hyphens=False) for text in said)]
-    parts += [_machines(study), *(f"![{text}]({file})" for file, (text, _) in PLOTS.items())]
+    parts += [_machines(study), f"![PSNR and SSIM against seconds of training]({PLOT})"]
     for summary in summaries:
         parts += [f"## {summary.scene}", _results(summary)]
         parts += [_times(summary)] if summary.targets else []
-    if study.failures:
-        rows = [(str(failure.key), failure.reason) for failure in study.failures]
-        parts += ["## Cells without a result", table(("cell", "reason"), rows)]
     ablation, tried = study.ablation, {result.variant for result in study.results}
-    tried |= {failure.key.variant for failure in study.failures}
     variants = [
         (name, ", ".join(overrides) or f"as {ablation.base}", ablation.notes.get(name, ""))
         for name, overrides in ablation.variants.items()

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 
 import torch
@@ -224,8 +223,6 @@ class Evaluations(Listener):
 
     Args:
         test: the test views, on the trainer's device.
-        lpips: from `load_lpips`, for the evaluation at the end; None: no LPIPS.
-        peak_memory: gives the bytes to record; None: the peak of the process so far.
 
     Attributes:
         history: every evaluation.
@@ -233,8 +230,6 @@ class Evaluations(Listener):
     """
 
     test: PosedImages
-    lpips: Lpips | None = None
-    peak_memory: Callable[[], int] | None = None
     history: list[Evaluation] = field(default_factory=list, init=False)
     metrics: Metrics | None = field(default=None, init=False)
 
@@ -255,7 +250,6 @@ class Evaluations(Listener):
             trainer.gaussians,
             self.test,
             trainer.look(self.test.names),
-            lpips=self.lpips if loop.finished else None,
             aligned=trainer.exposures is not None,
             refined=loop.finished,
         )
@@ -267,7 +261,7 @@ class Evaluations(Listener):
             ssim=mean.ssim,
             l1=mean.l1,
             num_gaussians=len(trainer.gaussians),
-            memory_bytes=self.peak_memory() if self.peak_memory else peak_memory_bytes(trainer.device),
+            memory_bytes=peak_memory_bytes(trainer.device),
             nonfinite_losses=int(trainer.nonfinite_losses),
             skipped_updates=int(trainer.optimizer.skipped),
             worst_psnr=metrics.worst_psnr,

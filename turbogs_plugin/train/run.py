@@ -226,7 +226,7 @@ def _posed_capture(config: Config, out: Path) -> str:
         return config.scene.path
     from turbogs_plugin.reconstruct.run import reconstruct_beside  # no other run needs that room
 
-    return str(reconstruct_beside(config, out))
+    return str(reconstruct_beside(Path(config.scene.path), out))
 
 
 def _try_lpips(config: Config, reported: bool) -> None:
