@@ -44,14 +44,6 @@ def test_a_scenes_rows_follow(tells_errors):
     assert_rows_follow(scene)
 
 
-def test_without_a_refinement_a_scene_stays_as_it_is():
-    host = Host(TurboDensityStrategy(refine_start_iter=100))
-    scene = with_scene(host)
-    before = scene.component_index
-    host.train(3)
-    assert scene.component_index is before
-
-
 def test_a_row_update_takes_a_scene_along():
     host = Host(TurboDensityStrategy())
     host.step(0)

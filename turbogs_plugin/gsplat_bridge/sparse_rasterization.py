@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import weakref
 from collections.abc import Callable
 from numbers import Integral
@@ -230,14 +229,9 @@ def _call(loss: Any, colors: Tensor, targets: Tensor, samples: PixelSamples) -> 
     """The output of a loss on samples.
 
     Raises:
-        InputError: it is none.
+        InputError: `loss` is a class, or gives anything but a `LossOutput`.
     """
-    output = None
-    try:
-        output = None if isinstance(loss, type) else loss(colors, targets, samples)
-    except TypeError:  # of its own, or as it takes other arguments
-        if _takes_three(loss):
-            raise
+    output = None if isinstance(loss, type) else loss(colors, targets, samples)
     if not isinstance(output, LossOutput):
         name = getattr(loss, "__name__", type(loss).__name__)
         found = f"the class {name}" if isinstance(loss, type) else name
@@ -246,15 +240,6 @@ def _call(loss: Any, colors: Tensor, targets: Tensor, samples: PixelSamples) -> 
             "with (colors, targets, samples) and gives a LossOutput"
         )
     return output
-
-
-def _takes_three(loss: Any) -> bool:
-    """Whether it can be called with colours, targets and samples."""
-    try:
-        inspect.signature(loss.forward if isinstance(loss, torch.nn.Module) else loss).bind(None, None, None)
-    except (TypeError, ValueError):  # not callable, of other arguments, or one that does not tell
-        return False
-    return True
 
 
 class _Loss(torch.autograd.Function):
