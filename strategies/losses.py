@@ -1,7 +1,7 @@
 """Losses on sampled pixels (paper section 3.7), as `LossTerms` that every engine can evaluate.
 
 Every loss here is a mean over all filled samples of the K views together, or over the listed tiles, so its gradients
-are as large as those of a dense mean loss. The samplers list no tile without a sample; one that is listed all the same
+are as large as a dense mean loss has them. The samplers list no tile without a sample; one that is listed all the same
 has no loss. Formulas: `turbogs_plugin.engine.reference.losses`.
 """
 
@@ -55,8 +55,8 @@ class CharbonnierNccLoss(RuleLoss):
     in the backward pass. The structure term's gradient is *added*: the appendix's minus would lower the correlation.
 
     In every tile, each entry of the gradient is at most ``w / (3 n) + ncc_weight / T`` (n filled samples, T tiles):
-    lambda keeps the sum of the structure term's gradients in a tile below that of l1. The gradient is exactly 0 where
-    x = y; that of the structure term also in tiles of one sample, or constant in both x and y.
+    lambda keeps the sum of the structure term's gradients in a tile below the sum of l1's. The gradient is exactly 0
+    where x = y; the structure term's is 0 also in tiles of one sample, or constant in both x and y.
 
     Args:
         ncc_weight: factor of the structure term; 1 in the paper.

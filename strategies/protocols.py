@@ -92,7 +92,7 @@ class SparseLoss(Protocol):
 
 @runtime_checkable
 class DensityController(Protocol):
-    """Where Gaussians are added and removed (section 3.8).
+    """Density control adds and removes Gaussians (section 3.8).
 
     A class that inherits from this one and keeps no state per Gaussian needs only `update`.
 
@@ -155,7 +155,7 @@ class GaussianOptimizer(Protocol):
 
     @property
     def per_view(self) -> bool:
-        """Whether `step` wants the gradients of each view, not only their sum."""
+        """True where `step` takes the gradients of each view, not only their sum."""
 
     @property
     def skipped(self) -> Tensor:

@@ -101,7 +101,7 @@ class ExponentialSchedule(_AdaptiveSchedule):
 
 @dataclass
 class FixedSchedule:
-    """The same K at every iteration, and r = lambda / K.
+    """A fixed K at every iteration, and r = lambda / K.
 
     Args:
         views: K, views of an iteration.

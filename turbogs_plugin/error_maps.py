@@ -78,7 +78,7 @@ class ErrorMaps:
         self.view_sums = torch.zeros(len(self.sizes), dtype=torch.float64, device=self.device)
         self._means = _LaggedCopy(self.view_sums, self.refresh)
         self._sums_read: np.ndarray | None = None
-        self._view_means = np.zeros(0)  # the latest means, and the sums that they are of
+        self._view_means = np.zeros(0)  # means of `_sums_read`
 
     def _allocate(self) -> None:
         self.offsets = np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1))])  # [V + 1]
@@ -133,8 +133,8 @@ class ErrorMaps:
         """Set the errors of one whole view.
 
         Args:
-            errors: [H * W] float, detached here; non-finite ones and those below 0 count as zero, as do those of
-                masked pixels.
+            errors: [H * W] float, detached here; an error that is not finite, is below 0 or is a masked pixel's
+                counts as zero.
 
         Raises:
             InputError: another shape.
@@ -218,7 +218,7 @@ class ErrorMaps:
         wait for the device). They depend on the number of calls alone, never on timing.
         """
         sums = self._means.read()
-        if sums is not self._sums_read:  # on a GPU they are the same for `refresh` calls
+        if sums is not self._sums_read:  # a GPU's sums change every `refresh` calls
             self._sums_read, self._view_means = sums, np.maximum(sums, 0.0) / self._pixel_counts
         return self._view_means.copy()
 

@@ -21,7 +21,7 @@ FINAL_PRUNINGS = 3
 """Final prunings at most. The paper's runs of 5000 and 8000 iterations have two and three. A run that was made longer
 without what counts iterations would have dozens, and lose most of its model to them."""
 MOST_ROOM = 2.0
-"""Times its cap that a model may have while it grows, however much the final prunings remove."""
+"""Largest size of a growing model in times of its cap, however much the final prunings remove."""
 
 
 @dataclass
@@ -149,7 +149,7 @@ class ErrorDrivenDensity(WindowedDensity):
         return errors + self.lambda_base * step.anneal * distances, seen
 
     def due(self, step: Step) -> tuple[bool, bool]:
-        """Whether this iteration densifies, and whether it makes a final pruning."""
+        """(densifies, prunes finally): the two kinds of event at this iteration."""
         iteration, after = step.iteration, step.iteration - step.refine_until
         densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
         final = 0 < after <= self._final_prunings(step) * self.final_every and after % self.final_every == 0
@@ -167,13 +167,13 @@ class ErrorDrivenDensity(WindowedDensity):
         return math.floor(self.max_gaussians * self.growth_room(step) + 1e-6)
 
     def _reduction_due(self, step: Step) -> bool:
-        """Whether a model beyond its bound is reduced: after densification, where a time budget has made the run too
-        short for a final pruning that was counted on."""
+        """A model beyond its bound is reduced at this iteration: after densification, where a time budget has made the
+        run too short for a final pruning that was counted on."""
         after = step.iteration > step.refine_until and step.iteration % self.refine_every == 0
         return after and self.max_gaussians > 0 and self._stats is not None
 
     def _last_event(self, step: Step) -> int:
-        """Iteration after which no statistics are needed: that of the last event, or where densification ends.
+        """Iteration after which no statistics are needed: the last event's, or the end of densification.
 
         Not the iteration of the last densification: a time budget may still move `refine_until` and make room for
         another one.
@@ -181,13 +181,13 @@ class ErrorDrivenDensity(WindowedDensity):
         return step.refine_until + self._final_prunings(step) * self.final_every
 
     def _final_prunings(self, step: Step) -> int:
-        """How many the run has."""
+        """Number of final prunings of the run."""
         # Half an interval at least is left after the last, so that a length which is off by a few has as many.
         fitting = math.floor((step.total - step.refine_until) / self.final_every - 0.5)
         return min(FINAL_PRUNINGS, max(0, fitting)) if self.final_keep < 1 else 0
 
     def _final_prunings_left(self, step: Step) -> int:
-        """How many come after this iteration."""
+        """Number of final prunings after this iteration."""
         over = max(0, step.iteration - step.refine_until) // self.final_every
         return max(0, self._final_prunings(step) - over)
 
@@ -278,7 +278,7 @@ class ErrorDrivenDensity(WindowedDensity):
     def _within_bound(
         self, kept: Tensor, count: int, worth: Tensor, known: Tensor, spared: Tensor, step: Step
     ) -> Tensor:
-        """[N] bool, which of the `count` that would be kept are: not those of least worth, if the cap allows fewer."""
+        """[N] bool: the `count` Gaussians of `kept`, without the ones of least worth where the cap allows fewer."""
         excess = count - self.bound(step) if self.max_gaussians > 0 else 0
         return kept & ~_least(worth, known, kept, spared, excess) if excess > 0 else kept
 
@@ -309,7 +309,7 @@ class ErrorDrivenDensity(WindowedDensity):
 def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
     """The value at rank ``floor(fraction * n)`` of the n masked values [N] in ascending order; 0 if there are none.
 
-    So many values, or fewer in case of ties, are less than it.
+    At most ``floor(fraction * n)`` values are less than it, fewer in case of ties.
     """
     chosen = values[mask]
     if len(chosen) == 0:

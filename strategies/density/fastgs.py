@@ -32,7 +32,7 @@ BLAME_THRESHOLD = 0.9
 
 @dataclass
 class ViewVotes:
-    """What the batches of a window say about each Gaussian, [N] float32 each. A batch is the views of one iteration.
+    """Votes of a window's batches about each Gaussian, [N] float32 each. A batch is the views of one iteration.
 
     Args:
         seen: number of batches in which the Gaussian had weight.

@@ -93,7 +93,7 @@ class GsplatDefaultDensity(WindowedDensity):
         return removal(leave_one(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians))
 
     def _change(self, gaussians: Gaussians, params: dict, optimizers: dict, state: dict) -> RowUpdate | None:
-        """What gsplat has changed, as a `RowUpdate`."""
+        """The change that gsplat has made, as a `RowUpdate`."""
         source = state["source_row"]
         fresh, opacity_fresh = (new_rows(params, optimizers, name) for name in ("means", "opacities"))
         was_reset = bool(opacity_fresh.all()) and not bool(fresh.all())

@@ -47,7 +47,7 @@ class WindowedDensity(DensityController):
 
 
 def add_stats(window: GaussianStats, new: GaussianStats) -> None:
-    """Add statistics to those of a window, in place."""
+    """Add statistics to a window's sums, in place."""
     for name, value in vars(new).items():
         total = getattr(window, name)
         if name == "max_radii":
@@ -57,7 +57,7 @@ def add_stats(window: GaussianStats, new: GaussianStats) -> None:
 
 
 def saved_rows(rows: RowsType | None) -> dict[str, Tensor] | None:
-    """What `loaded_rows` takes: name of a field -> [N], or None."""
+    """The state that `loaded_rows` takes: name of a field -> [N], or None."""
     return None if rows is None else dict(vars(rows))
 
 

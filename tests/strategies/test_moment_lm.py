@@ -11,7 +11,6 @@ from helpers.optimizers import STEP, all_finite, clone, equal, make_gaussians, m
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
@@ -233,12 +232,3 @@ def test_a_useless_share_of_the_loss(share):
     optimizer.step(gaussians, gradients, STEP)
     assert all_finite(gaussians)
     assert int(optimizer.skipped) == 0
-
-
-@pytest.mark.parametrize(
-    "values",
-    [{"units": "metres"}, {"rows": "pixels"}, {"curvature": -1.0}, {"max_step": math.inf}],
-)
-def test_refuses(values):
-    with pytest.raises(InputError, match=next(iter(values))):
-        MomentLMOptimizer(**values)

@@ -47,8 +47,8 @@ class TurboDensityStrategy(DefaultStrategy):
     A subclass of `DefaultStrategy`, since trainers branch on that. Its fields keep their meaning there:
     refine_start_iter, refine_stop_iter, refine_every, prune_opa, grow_grad2d, grow_scale3d, prune_scale3d, and
     prune_scale2d where refine_scale2d_stop_iter is above 0; any of them may change at any time. Opacities are never
-    reset; reset_every only says when pruning by size begins. grow_scale2d has no effect. The fields below are those of
-    `ErrorDrivenDensity` of the same name.
+    reset; reset_every only says when pruning by size begins. grow_scale2d has no effect. The fields below are named
+    and meant as in `ErrorDrivenDensity`.
 
     The defaults are the values of `configs/turbogs.yaml`, read from there, also for grow_scale3d. But who grows is
     gated by gradients (`tuned.GATES`), where turbogs draws by squares. When and how often is refined stays gsplat's, as
@@ -67,7 +67,7 @@ class TurboDensityStrategy(DefaultStrategy):
             grow_absgrad2d and prune_score_fraction to turbogs' values with it.
         max_gaussians: never more, at any step, as the end of the run is not known.
         final_every, final_keep: final pruning after refine_stop_iter, three times at most; off where final_keep is 1.
-        seed: of the positions of split Gaussians.
+        seed: decides the positions of split Gaussians.
     """
 
     grow_grad2d: float = TUNED_DENSITY.grad_threshold
@@ -200,7 +200,7 @@ class TurboDensityStrategy(DefaultStrategy):
         return window
 
     def _due(self, step: int) -> bool:
-        """Whether a densification or a final pruning happens at this step, at gsplat's places in the schedule."""
+        """True at a step with a densification or a final pruning, at gsplat's places in the schedule."""
         if step < self.refine_stop_iter:
             return step > self.refine_start_iter and step % self.refine_every == 0
         return (step - self.refine_stop_iter + 1) % self.final_every == 0

@@ -1,4 +1,4 @@
-"""What the sparse swap needs once, before the loop: how many views and pixels a step, and the error maps."""
+"""Set-up of the sparse swap before the loop: views and pixels a step, and the error maps."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ GATES = {
     "final_keep": 1.0,
 }
 """Settings in place of turbogs' draw by squares, which gsplat's rasterization does not give, and of final pruning.
-docs/drop-in.md was measured so."""
+The numbers of docs/drop-in.md were measured with them."""
 
 TUNED_DENSITY = ErrorDrivenDensity(**_settings("density") | GATES)
 """Density control with the settings of `configs/turbogs.yaml`, but for `GATES`."""
