@@ -87,7 +87,7 @@ class SparseSsimLoss(RuleLoss):
     """``(1 - ssim_weight) * l1 + ssim_weight * mean over tiles and channels of (1 - SSIM)``, 3DGS' mixture.
 
     A tile's SSIM is the mean over its samples, each in a Gaussian window of 11x11 pixels (Wang et al. 2004) that ends
-    at the tile's edge. It is of use where whole tiles are sampled.
+    at the tile's edge. The loss is of use where whole tiles are sampled.
 
     Args:
         ssim_weight: weight of the structure term, 0 .. 1; 0.2 in 3DGS.

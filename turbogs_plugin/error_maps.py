@@ -1,8 +1,8 @@
 """Persistent error and age of every pixel of every training view (paper section 3.3).
 
 The maps of all views lie end to end in one array ("flat pixels"), so views may differ in size. For each pixel the
-iteration of its last visit is stored, its "stamp". This gives the same ages as the paper's counters, plus one, and only
-the sampled pixels have to be written. The sum of a view's errors is updated incrementally. Errors are stored in half
+iteration of its last visit is stored, its "stamp". Stamps give the ages of the paper's counters, plus one, and only the
+sampled pixels have to be written. The sum of a view's errors is updated incrementally. Errors are stored in half
 precision and their sums in double, so the sums are exact (below 2^29 a view) and do not drift.
 
 Without Gaussians, from plain error images::
@@ -122,7 +122,8 @@ class ErrorMaps:
     def fetch(self, view_ids: Sequence[int]) -> None:
         """Make the maps of these views available in `errors` and `stamps`, from `offsets` on.
 
-        Call it before reading or writing these arrays. Here all views are always there; see `scene/offload.py`.
+        Call it before reading or writing these arrays. All views are always there in `ErrorMaps`; see
+        `scene/offload.py`.
         """
 
     def flat_pixels(self, samples: PixelSamples) -> Tensor:
@@ -212,8 +213,8 @@ class ErrorMaps:
     def view_means(self) -> np.ndarray:
         """[V] float64 on the host: mean error of each view, over its pixels that are not masked; 0 if all are.
 
-        On the CPU they are exact. Elsewhere reading them at every call would stall the device, so a copy is started
-        at every `refresh`-th call and read at the next such call. So the means are between `refresh` and
+        On the CPU they are exact. Elsewhere reading them at every call would stall the device, so a copy is started at
+        every `refresh`-th call and read at the next such call. The means are therefore between `refresh` and
         ``2 * refresh - 1`` calls old (between 0 and ``2 * refresh - 1`` after the first call or `initialise`, which
         wait for the device). They depend on the number of calls alone, never on timing.
         """

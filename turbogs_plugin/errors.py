@@ -21,7 +21,8 @@ class InputError(ValueError):
 class TrainingStopped(RuntimeError):
     """A run that cannot go on: one line that says at which iteration and why.
 
-    What the run saved before stays as it is. The command line prints it without a traceback and exits with code 1.
+    Files that the run saved before stay as they are. The command line prints the line without a traceback and exits
+    with code 1.
     """
 
 

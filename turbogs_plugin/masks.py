@@ -1,8 +1,8 @@
 """Masks of the pixels that count in each view, as lists of the tiles that have a pixel left.
 
 A *live* tile has at least one pixel that is not masked. Draws go over live tiles alone, so the others cost nothing. A
-tile that the mask cuts has a bit for each of its pixels; all whole tiles share one row of bits. That is about an eighth
-of a byte a pixel or less, so masks stay on the device even where photos and error maps do not.
+tile that the mask cuts has a bit for each of its pixels; all whole tiles share one row of bits. Masks take an eighth of
+a byte a pixel or less, so they stay on the device even where photos and error maps do not.
 """
 
 from __future__ import annotations

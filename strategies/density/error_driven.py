@@ -39,9 +39,9 @@ class ErrorDrivenDensity(WindowedDensity):
     chosen, be it to grow or to be removed.
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
-    prunes. A Gaussian that is due for pruning is not densified. One that is too large is pruned unless it is split,
-    so also where the cap leaves no room to split it. Afterwards, every `final_every` iterations, an event only prunes.
-    At least one Gaussian is always left.
+    prunes. A Gaussian that is due for pruning is not densified. A Gaussian that is too large is pruned unless it is
+    split, also where the cap leaves no room to split it. Afterwards, every `final_every` iterations, an event only
+    prunes. At least one Gaussian is always left.
 
     Args:
         lambda_base: weight of the distance term in the score; 0.8 in the paper.
@@ -72,18 +72,19 @@ class ErrorDrivenDensity(WindowedDensity):
         opacity_decay: share of its opacity that every Gaussian loses at each densification event. If the photos need
             it, it grows back; if not, it falls below `prune_opacity`. A gentle substitute for 3DGS's reset.
         spare_beyond: distance from the cameras' centre, in scene extents, beyond which Gaussians are neither decayed
-            nor pruned (unless they are not finite, or `max_gaussians` leaves no other choice). It protects a backdrop
-            behind the scene, which few photos see. 0: none.
+            nor pruned (unless they are not finite, or `max_gaussians` leaves no other choice). The distance protects a
+            backdrop behind the scene, which few photos see. 0: none.
         choose_by: rule by which Gaussians grow and are removed. `difficulty`, the paper's: all grow that pass the
             thresholds, or the most difficult of them where `max_gaussians` has no room for all; the easiest are removed
-            first. `squares` (see `growth`): as many grow as pass the threshold of the absolute gradient; which ones
-            is drawn at random among those seen, in proportion to their squares. Those with the least squares are
+            first. `squares` (see `growth`): as many grow as pass the threshold of the absolute gradient; which ones is
+            drawn at random among those seen, in proportion to their squares. Gaussians with the least squares are
             removed first. `grad_threshold`, `top_fraction`, `score` and `lambda_base` then mean nothing.
         final_every: interval of the final pruning, Delta_prune; 500 in the paper. There are `FINAL_PRUNINGS` at most,
             the last one half an interval or more before the end.
         final_keep: share of the Gaussians, seen and not spared, that a final pruning keeps, eta_final; 0.8 .. 0.95 in
             the paper. 1 keeps all.
-        prune_opacity: opacity below which Gaussians are pruned. This and the following are 3DGS's values, no settings.
+        prune_opacity: opacity below which Gaussians are pruned. The value and the following ones are 3DGS's, no
+            settings.
         prune_world_size: largest standard deviation of a Gaussian over `prune_world_reference`. 0: off.
         prune_screen_size: largest screen radius of a Gaussian over the larger side of the image. 0: off; 3DGS has such
             a rule, which never takes effect there.
@@ -162,8 +163,8 @@ class ErrorDrivenDensity(WindowedDensity):
         return 1 / max(1 / MOST_ROOM, self.final_keep ** self._final_prunings_left(step))
 
     def bound(self, step: Step) -> int:
-        """Most Gaussians after an event at this iteration; 0: any number. What is grown beyond the cap and then removed
-        by worth makes a better model of as many Gaussians than what never was beyond it (docs/lab/tried.md)."""
+        """Most Gaussians after an event at this iteration; 0: any number. A model that grew beyond its cap and was then
+        reduced by worth is better than one of its size that never was beyond (docs/lab/tried.md)."""
         return math.floor(self.max_gaussians * self.growth_room(step) + 1e-6)
 
     def _reduction_due(self, step: Step) -> bool:
@@ -250,7 +251,7 @@ class ErrorDrivenDensity(WindowedDensity):
         return oversized
 
     def _worth(self, step: Step) -> tuple[Tensor, Tensor, Tensor]:
-        """([N] worth, [N] bool where it is known, [N] bool seen). What is worth less is removed sooner.
+        """([N] worth, [N] bool where it is known, [N] bool seen). Gaussians that are worth less are removed sooner.
 
         Worth is the score, or the squares. A Gaussian that was not seen has no known score; its squares are 0, so by
         squares it is worth least.

@@ -143,17 +143,6 @@ def test_scale_of_the_loss_does_not_matter(factor, dtype, tolerance):
         assert (first - second).norm() <= tolerance * first.norm(), name
 
 
-def test_scale_of_the_loss_does_matter_in_the_papers_units():
-    paths = []
-    for scale in (1.0, 1e3):
-        gaussians = make_gaussians(5)
-        optimizer = MomentLMOptimizer(units="paper")
-        optimizer.setup(gaussians)
-        optimizer.step(gaussians, scaled(make_gradients(3, 5, size=1e-2), scale), STEP)
-        paths.append(gaussians.means)
-    assert not torch.allclose(*paths, rtol=1e-2)
-
-
 @given(
     st.lists(st.floats(-30, 30), min_size=14, max_size=14),
     st.integers(1, 4),

@@ -44,11 +44,11 @@ _ANNOUNCEMENTS = {
 class TurboDensityStrategy(DefaultStrategy):
     """`ErrorDrivenDensity` behind the protocol of gsplat's strategies.
 
-    A subclass of `DefaultStrategy`, since trainers branch on that. Its fields keep their meaning there:
+    A subclass of `DefaultStrategy`, since trainers branch on that. Fields of `DefaultStrategy` keep their meaning:
     refine_start_iter, refine_stop_iter, refine_every, prune_opa, grow_grad2d, grow_scale3d, prune_scale3d, and
     prune_scale2d where refine_scale2d_stop_iter is above 0; any of them may change at any time. Opacities are never
-    reset; reset_every only says when pruning by size begins. grow_scale2d has no effect. The fields below are named
-    and meant as in `ErrorDrivenDensity`.
+    reset; reset_every only says when pruning by size begins. grow_scale2d has no effect. The fields below are named and
+    meant as in `ErrorDrivenDensity`.
 
     The defaults are the values of `configs/turbogs.yaml`, read from there, also for grow_scale3d. But who grows is
     gated by gradients (`tuned.GATES`), where turbogs draws by squares. When and how often is refined stays gsplat's, as
@@ -56,8 +56,8 @@ class TurboDensityStrategy(DefaultStrategy):
     the cameras' centre and a backdrop stands behind the scene.
 
     Once a line ``info.update(prediction=colors, ground_truth=pixels)`` stands before ``loss.backward()``, Gaussians are
-    ranked by the error they carry (see `gaussian_errors`); without it, by their screen gradients. Which of the two
-    it is, is printed at the first step, and must stay so.
+    ranked by the error they carry (see `gaussian_errors`); without it, by their screen gradients. The first step prints
+    which of the two ranks them, and later steps must agree.
 
     Args:
         absgrad: also densify by absolute gradients above grow_absgrad2d; render with ``absgrad=True`` then.
@@ -126,8 +126,8 @@ class TurboDensityStrategy(DefaultStrategy):
         """To be called after the optimizers' steps. Changes `params`, `optimizers` and `state` in place.
 
         Args:
-            packed, host_options: what hosts hand to their own strategies; not used. Whether `info` is packed, it says
-                itself.
+            packed, host_options: what hosts hand to their own strategies; not used. `info` says itself whether it is
+                packed.
             scene: of gsplat from 1.6 on, a container with more arrays over Gaussians, whose rows follow.
 
         Raises:
@@ -239,8 +239,8 @@ def apply_row_update(
     Args:
         update: new rows; parameters that it does not know are copied row by row.
         params, optimizers, state: as in gsplat's operations; changed in place.
-        scene: a `gsplat.scene.Scene`, as gsplat's operations take it from 1.6 on, or None. Its hooks are called, by
-            which `GaussianScene` keeps `component_index` and `signal`: row i becomes a copy of old row `source[i]`.
+        scene: a `gsplat.scene.Scene`, as gsplat's operations take it from 1.6 on, or None. Its hooks are called,
+            by which `GaussianScene` keeps `component_index` and `signal`: row i becomes a copy of old row `source[i]`.
     """
     count = len(params["means"])
     for name, parameter in [*params.items()]:

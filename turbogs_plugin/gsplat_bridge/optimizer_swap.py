@@ -1,8 +1,9 @@
 """`SparseAdam` and `MomentLMOptimizer` behind gsplat's dict of optimizers, one for each parameter.
 
 A Gaussian's parameters are solved for together, but a gsplat trainer steps one optimizer after another and clears each
-gradient in between. So each member of the dict is a `torch.optim.Optimizer` that *hands over* its gradient when it is
-stepped, and whichever member comes last, in any order, carries out the update of all. Until then no parameter moves.
+gradient in between. Each member of the dict is therefore a `torch.optim.Optimizer` that *hands over* its gradient when
+it is stepped, and whichever member comes last, in any order, carries out the update of all. Until then no parameter
+moves.
 
 A member's ``state`` holds what is kept for its parameter, as gsplat's operations on rows expect: the moments are
 tensors with one row a Gaussian; "step", which they leave as it is, is one number. The bias correction counts steps of
@@ -133,7 +134,7 @@ class SharedOptimizer:
     def drop_stale(self) -> None:
         """Forget the gradients of an iteration in which not all members were stepped, as soon as the next one begins.
 
-        A `GradScaler` leaves out each optimizer whose gradient has an inf. Its iteration is then skipped whole, for all
+        A `GradScaler` leaves out each optimizer whose gradient has an inf. The iteration is then skipped whole, for all
         parameters, so no update mixes two iterations. The first such iteration is printed.
 
         Raises:

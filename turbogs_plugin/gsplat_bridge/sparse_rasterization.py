@@ -233,8 +233,7 @@ def _call(loss: Any, colors: Tensor, targets: Tensor, samples: PixelSamples) -> 
     """
     output = None if isinstance(loss, type) else loss(colors, targets, samples)
     if not isinstance(output, LossOutput):
-        name = getattr(loss, "__name__", type(loss).__name__)
-        found = f"the class {name}" if isinstance(loss, type) else name
+        found = f"the class {loss.__name__}" if isinstance(loss, type) else f"a {type(loss).__name__}"
         raise InputError(
             f"loss is {found}: expected an instance of a loss on samples, as CharbonnierNccLoss() is, which is called "
             "with (colors, targets, samples) and gives a LossOutput"

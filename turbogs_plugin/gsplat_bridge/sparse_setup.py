@@ -22,8 +22,8 @@ def sparse_budget(num_views: int, batch_size: int | None = None) -> SamplingBudg
     """Views and rate of every step of a gsplat trainer with sparse pixels; prints in one line what it chose.
 
     The rule: a step sees as many pixels as one whole image has, which is what a stock trainer sees at batch 1, spread
-    over its K views: ``rate = pixel_budget / K``, with the pixel_budget of `configs/turbogs.yaml`, which is 1. So at
-    batch 1 every pixel is drawn, and nothing is lost against stock. The rate is never less than the least of turbogs'
+    over its K views: ``rate = pixel_budget / K``, with the pixel_budget of `configs/turbogs.yaml`, which is 1. At batch
+    1 every pixel is drawn, and nothing is lost against stock. The rate is never less than the least of turbogs'
     schedule, ``pixel_budget / max_views``; batches larger than that see more than one image.
 
     Args:

@@ -60,7 +60,7 @@ class Cameras:
         self._Ks = Ks
 
     def select(self, view_ids: Sequence[int]) -> Cameras:
-        """The cameras of these views, in this order; `range` for a run of them. This launches nothing on a device.
+        """The cameras of these views, in this order; `range` for a run of them. Nothing is launched on a device.
 
         The selected cameras share memory with the present ones until their `viewmats` or `Ks` are read, which makes a
         copy. Where gradients flow to the present cameras, the copy is made at once.

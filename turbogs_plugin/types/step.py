@@ -36,7 +36,7 @@ class Step:
 
 @dataclass(frozen=True)
 class SamplingBudget:
-    """How much one iteration samples: `views` (K) views, and the fraction `rate` (r) of each tile's pixels."""
+    """Samples of one iteration: `views` (K) views, and the fraction `rate` (r) of each tile's pixels."""
 
     views: int
     rate: float
