@@ -38,7 +38,8 @@ def test_it_is_a_default_strategy_with_its_fields_and_hooks():
 
 
 def test_its_defaults_are_the_values_of_turbogs():
-    """Those of `configs/turbogs.yaml` as a run takes them, but for the gates and those of our own scenes' frame."""
+    """Defaults equal `configs/turbogs.yaml` as a run takes it, but for the gates and the settings of our own scenes'
+    frame."""
     section = load_config("turbogs").density
     controller = vars(TurboDensityStrategy()._controller(0))
     schedule = {"refine_from", "refine_every", "prune_size_from"}  # gsplat's, which its trainers scale
@@ -51,7 +52,7 @@ def test_its_defaults_are_the_values_of_turbogs():
 
 @dataclass
 class TrainerConfig:
-    """As in gsplat's trainer, whose command line is made by tyro from the type and the default."""
+    """Configuration like gsplat's trainer's, whose command line tyro makes from the type and the default."""
 
     strategy: DefaultStrategy | MCMCStrategy = field(default_factory=DefaultStrategy)
 
@@ -172,7 +173,7 @@ NEED_ERRORS = {
         "pruned by squares": {"prune_score_fraction": 0.3, "choose_by": "squares"},
     }.items()
 }
-"""The same, of those that only a host with errors can have."""
+"""Fields as in `FIELDS` that only a host with errors can have."""
 
 
 def controlled(options, before, window, seed, extent, refine_until):
@@ -196,7 +197,7 @@ def differ(some: Gaussians, other: Gaussians) -> bool:
     ("name", "tells_errors"), [*product(FIELDS, (False, True)), *((name, True) for name in NEED_ERRORS)]
 )
 def test_an_event_is_the_controllers_with_these_values(name, tells_errors):
-    """And what a field changes, it changes: with the base's values the controller does something else."""
+    """A field changes the event: with the base's values the controller does something else."""
     fields, options = (FIELDS | NEED_ERRORS)[name]
     strategy = TurboDensityStrategy(**{**BASE, **fields})
     host = Host(strategy, tells_errors=tells_errors)

@@ -1,4 +1,4 @@
-"""The protocol of gsplat's main branch (1.6): hosts pass a `Scene`, whose rows follow those of the parameters."""
+"""The protocol of gsplat's main branch (1.6): hosts pass a `Scene`, whose rows follow the parameters' rows."""
 
 import functools
 

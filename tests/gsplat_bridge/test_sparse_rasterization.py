@@ -296,7 +296,7 @@ def test_a_degree_may_be_an_integer_of_numpy(scene):
 
 @pytest.mark.parametrize("name", ["viewmats", "Ks"])
 def test_cameras_that_want_a_gradient_are_refused(scene, name):
-    """As a trainer's pose optimisation does: it would train on without ever moving a camera."""
+    """A trainer's pose optimisation would train on without ever moving a camera."""
     splats, cameras, samples = scene
     given = arguments(splats, cameras)
     given[name] = given[name].clone().requires_grad_() * 1.0

@@ -163,7 +163,7 @@ def test_events_are_when_the_table_says():
 
 
 def test_an_end_that_moves_on_has_room_for_another_event():
-    """As a time budget moves it, before it is there: 420, which the event at 400 is the last one of, becomes 460."""
+    """A time budget moves the end from 420, whose last event is at 400, to 460, before the run is there."""
     gaussians = make_gaussians(5)
     density = ErrorDrivenDensity(refine_every=50, final_keep=1.0, opacity_decay=0.1)
     density.setup(gaussians)
@@ -398,7 +398,7 @@ def test_the_cap_holds_at_the_end(cap, keep, every, choose_by, seen, far):
     ("base", "refine_until", "every", "prunings"), [(5000, 3500, 500, 2), (8000, 6000, 500, 3), (30_000, 3500, 500, 3)]
 )
 def test_runs_of_any_length_have_as_many_final_prunings(base, refine_until, every, prunings):
-    """And the last leaves half an interval, however the length and what is scaled with it were rounded."""
+    """The last pruning leaves half an interval, however the length and what is scaled with it were rounded."""
     for total in range(200, 12_000, 7):
         until, interval = round(refine_until * total / base), round(every * total / base)
         density = ErrorDrivenDensity(final_every=interval)

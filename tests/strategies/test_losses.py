@@ -30,7 +30,7 @@ STRUCTURED = [loss for loss in EVERY if isinstance(loss, CharbonnierNccLoss)]
 
 
 def make_samples(counts, empty=(), weights=None):
-    """Tiles of a 16-pixel-high strip with so many slots each; the last `empty[tile]` of a tile are empty."""
+    """Tiles of a 16-pixel-high strip with `counts` slots; the last `empty[tile]` of a tile are empty."""
     counts = np.asarray(counts)
     places = pixel_table(np.array([[16 * len(counts), 16]]), "cpu").numpy()
     ids = np.concatenate([places[tile, :count] for tile, count in enumerate(counts)])
@@ -214,7 +214,7 @@ def test_empty_slots_have_no_part(loss):
 
 @pytest.mark.parametrize("loss", EVERY, ids=repr)
 def test_no_tile_is_no_loss(loss):
-    """As where masks hide all of a batch."""
+    """Masks that hide all of a batch leave no tile."""
     samples = make_samples([4])
     nothing = torch.zeros(0, dtype=torch.int32)
     samples = PixelSamples(samples.view_ids, samples.sizes, nothing, nothing, torch.zeros(1, dtype=torch.int32))
