@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, apply_row_update
+from turbogs_plugin.gsplat_bridge.density_swap import GATES
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
-from turbogs_plugin.gsplat_bridge.tuned import GATES
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer

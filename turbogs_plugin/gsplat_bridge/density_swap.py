@@ -23,11 +23,31 @@ from turbogs_plugin.gsplat_bridge.host import (
     require_one_process,
 )
 from turbogs_plugin.gsplat_bridge.optimizer_swap import COUNT, MemberOptimizer
-from turbogs_plugin.gsplat_bridge.tuned import TUNED_DENSITY
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.strategies.density.error_driven import FINAL_PRUNINGS, ErrorDrivenDensity
 from turbogs_plugin.strategies.density.rows import add_stats
 from turbogs_plugin.types import GaussianStats, RowUpdate, Step
+from turbogs_plugin.yaml_json import read_named_yaml
+
+TUNED: dict[str, dict[str, Any]] = {
+    section: {name: value for name, value in settings.items() if name != "type"}
+    for section, settings in read_named_yaml("turbogs", "turbogs_plugin.configs", "config").items()
+}
+"""Section -> settings of `configs/turbogs.yaml`, the defaults of what is swapped into a trainer."""
+
+GATES = {
+    "choose_by": "difficulty",
+    "prune_score_fraction": 0.0,
+    "top_fraction": 0.9,
+    "grad_threshold": 2e-4,
+    "absgrad_threshold": 2e-4,
+    "final_keep": 1.0,
+}
+"""Settings in place of turbogs' draw by squares, which gsplat's rasterization does not give, and of final pruning. The
+numbers of docs/drop-in.md were measured with them."""
+
+TUNED_DENSITY = ErrorDrivenDensity(**TUNED["density"] | GATES)
+"""Density control with the settings of `configs/turbogs.yaml`, but for `GATES`."""
 
 _STATS = tuple(field.name for field in fields(GaussianStats))
 _DRIVEN_BY = "driven_by"
@@ -51,7 +71,7 @@ class TurboDensityStrategy(DefaultStrategy):
     meant as in `ErrorDrivenDensity`.
 
     The defaults are the values of `configs/turbogs.yaml`, read from there, also for grow_scale3d. But who grows is
-    gated by gradients (`tuned.GATES`), where turbogs draws by squares. When and how often is refined stays gsplat's, as
+    gated by gradients (`GATES`), where turbogs draws by squares. When and how often is refined stays gsplat's, as
     trainers scale those fields. `prune_world_reference` and `spare_beyond` are left out: they hold where the origin is
     the cameras' centre and a backdrop stands behind the scene.
 

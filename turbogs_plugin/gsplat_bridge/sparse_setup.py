@@ -10,8 +10,12 @@ import torch
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, require
-from turbogs_plugin.gsplat_bridge.tuned import TUNED_SCHEDULE
+from turbogs_plugin.gsplat_bridge.density_swap import TUNED
+from turbogs_plugin.strategies.schedule import SinusoidalSchedule
 from turbogs_plugin.types import SamplingBudget
+
+TUNED_SCHEDULE = SinusoidalSchedule(**TUNED["schedule"])
+"""The schedule of views and rate with the settings of `configs/turbogs.yaml`."""
 
 DEFAULT_VIEWS = 4
 """Views a step where a trainer leaves it open. Between the 3 and 10 of turbogs' schedule; a quarter of one view's
