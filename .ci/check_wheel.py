@@ -64,10 +64,9 @@ def undefined_symbols(library: Path) -> list[str]:
 
 
 def stray_files(names: list[str]) -> list[str]:
-    """Files of a wheel that are neither modules, configurations, parts of the exported page, the library nor
-    metadata."""
-    modules, pages = r"[\w/]+\.py|configs/[\w/-]+\.yaml", r"export/web/\w+\.(html|css|js)"
-    ours = re.compile(rf"turbogs_plugin/({modules}|{pages})|{re.escape(LIBRARY)}")
+    """Files of a wheel that are neither modules, configurations, the mark of types, the library nor metadata."""
+    modules = r"[\w/]+\.py|configs/[\w/-]+\.yaml|py\.typed"
+    ours = re.compile(rf"turbogs_plugin/({modules})|{re.escape(LIBRARY)}")
     return [name for name in names if not (ours.fullmatch(name) or name.split("/")[0].endswith(".dist-info"))]
 
 

@@ -43,7 +43,7 @@ TYPES = {
     },
     "density": {
         "error_driven": "density.error_driven:ErrorDrivenDensity",
-        "none": "density.none:NoDensity",
+        "none": "density.rows:NoDensity",
         "gsplat_default": "density.gsplat_default:GsplatDefaultDensity",
         "mcmc": "density.mcmc:GsplatMcmcDensity",
         "fastgs": "density.fastgs:FastGsDensity",

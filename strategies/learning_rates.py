@@ -15,8 +15,8 @@ class LearningRates:
     """The rates of 3DGS, with the decay of the means over the run and one factor for batches of views.
 
     With rate r, Adam moves a parameter by about r in an iteration whose gradients agree with the past ones, whatever
-    their size. The mean over K views has less noise than one view's gradient but no longer step. So a run of few
-    iterations of many views needs higher rates than 3DGS, which has one view.
+    their size. The mean over K views has less noise than one view's gradient but no longer step. A run of few
+    iterations of many views therefore needs higher rates than 3DGS, which has one view.
 
     Args:
         means: rate of the means at the first iteration, in units of the scene extent.
@@ -50,7 +50,7 @@ class LearningRates:
             )
 
     def at(self, step: Step) -> ParameterRates:
-        """The rates at an iteration. Those of the means are in world units (times `step.scene_extent`)."""
+        """The rates at an iteration. Rates of the means are in world units (times `step.scene_extent`)."""
         fraction = min(1.0, step.iteration / max(1, step.total))
         means = self.means and self.means * (self.means_final / self.means) ** fraction
         factor = self.batch_scale * self.final_factor**fraction

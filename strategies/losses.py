@@ -1,7 +1,7 @@
 """Losses on sampled pixels (paper section 3.7), as `LossTerms` that every engine can evaluate.
 
 Every loss here is a mean over all filled samples of the K views together, or over the listed tiles, so its gradients
-are as large as those of a dense mean loss. The samplers list no tile without a sample; one that is listed all the same
+are as large as a dense mean loss has them. The samplers list no tile without a sample; one that is listed all the same
 has no loss. Formulas: `turbogs_plugin.engine.reference.losses`.
 """
 
@@ -55,8 +55,8 @@ class CharbonnierNccLoss(RuleLoss):
     in the backward pass. The structure term's gradient is *added*: the appendix's minus would lower the correlation.
 
     In every tile, each entry of the gradient is at most ``w / (3 n) + ncc_weight / T`` (n filled samples, T tiles):
-    lambda keeps the sum of the structure term's gradients in a tile below that of l1. The gradient is exactly 0 where
-    x = y; that of the structure term also in tiles of one sample, or constant in both x and y.
+    lambda keeps the sum of the structure term's gradients in a tile below the sum of l1's. The gradient is exactly 0
+    where x = y; the structure term's is 0 also in tiles of one sample, or constant in both x and y.
 
     Args:
         ncc_weight: factor of the structure term; 1 in the paper.
@@ -87,7 +87,7 @@ class SparseSsimLoss(RuleLoss):
     """``(1 - ssim_weight) * l1 + ssim_weight * mean over tiles and channels of (1 - SSIM)``, 3DGS' mixture.
 
     A tile's SSIM is the mean over its samples, each in a Gaussian window of 11x11 pixels (Wang et al. 2004) that ends
-    at the tile's edge. It is of use where whole tiles are sampled.
+    at the tile's edge. The loss is of use where whole tiles are sampled.
 
     Args:
         ssim_weight: weight of the structure term, 0 .. 1; 0.2 in 3DGS.

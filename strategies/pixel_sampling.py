@@ -1,4 +1,4 @@
-"""Which pixels of the chosen views are rendered (paper section 3.5): samplers as rules that every engine can draw."""
+"""Samplers of the pixels that are rendered (paper section 3.5), as rules that every engine can draw."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ from turbogs_plugin.types import (
 
 @runtime_checkable
 class SamplingSchedule(Protocol):
-    """How many views an iteration samples, and which share of their pixels (appendix, adaptive scheduling)."""
+    """Chooses the number of views of an iteration, and the share of their pixels (appendix, adaptive scheduling)."""
 
     def query(self, step: Step, mean_error: float, initial_error: float, num_views: int) -> SamplingBudget:
         """The budget of this iteration; `views` never exceeds `num_views`."""
@@ -38,7 +38,7 @@ class SamplingSchedule(Protocol):
 
 @runtime_checkable
 class ViewSampler(Protocol):
-    """Which training views an iteration samples (section 3.4)."""
+    """Chooses the training views of an iteration (section 3.4)."""
 
     def setup(self, cameras: Cameras, scene_extent: float) -> None:
         """Take the geometry of the V training cameras; called once before training."""
@@ -53,7 +53,7 @@ class ViewSampler(Protocol):
 
 @runtime_checkable
 class PixelSampler(Protocol):
-    """Which pixels of the chosen views are rendered (section 3.5).
+    """Chooses the pixels of these views that are rendered (section 3.5).
 
     Attributes:
         heeds_masks: `sample` draws no masked pixel (``maps.masks``). Where it is False, the trainer takes masked pixels
@@ -92,7 +92,7 @@ class SparseLoss(Protocol):
 
 @runtime_checkable
 class DensityController(Protocol):
-    """Where Gaussians are added and removed (section 3.8).
+    """Density control adds and removes Gaussians (section 3.8).
 
     A class that inherits from this one and keeps no state per Gaussian needs only `update`.
 
@@ -115,8 +115,8 @@ class DensityController(Protocol):
         """Propose a change of the set of Gaussians, or None. Called after every optimizer step."""
 
     def event_due(self, step: Step) -> bool:
-        """Whether `update` may return a change at this iteration, or looks at more than is `watched`; on every process
-        alike.
+        """True where `update` may return a change at this iteration, or looks at more than is `watched`; on every
+        process alike.
 
         Where several processes train one model, each adds to the statistics of its own rows, and makes the step of its
         own rows of the model. Only at such an iteration are both complete when `update` is called, beside what is
@@ -126,8 +126,8 @@ class DensityController(Protocol):
         return True
 
     def growth_room(self, step: Step) -> float:
-        """How many times its cap a model may have after an event at this iteration, since later events remove the rest;
-        for a memory budget, which limits the largest number of a run."""
+        """Times its cap that a model may have after an event at this iteration, since later events remove the rest; for
+        a memory budget, which limits the largest number of a run."""
         return 1.0
 
     def apply(self, update: RowUpdate) -> None:
@@ -155,7 +155,7 @@ class GaussianOptimizer(Protocol):
 
     @property
     def per_view(self) -> bool:
-        """Whether `step` wants the gradients of each view, not only their sum."""
+        """True where `step` takes the gradients of each view, not only their sum."""
 
     @property
     def skipped(self) -> Tensor:

@@ -1,4 +1,4 @@
-"""How many views an iteration samples, and which share of their pixels (paper, appendix, adaptive scheduling).
+"""Schedules of the views of an iteration and the share of their pixels (paper, appendix, adaptive scheduling).
 
 All schedules but the fixed one share the appendix's two equations and differ in the modulation phi of the error
 ratio::
@@ -92,7 +92,7 @@ class LinearSchedule(_AdaptiveSchedule):
 class ExponentialSchedule(_AdaptiveSchedule):
     """phi(ratio) = (1 - exp(-3 ratio)) / (1 - exp(-3)).
 
-    The paper names an exponential variant but gives no equation. This one saturates and passes (0, 0) and (1, 1).
+    The paper names an exponential variant but gives no equation. The one here saturates and passes (0, 0) and (1, 1).
     """
 
     def phi(self, ratio: float) -> float:
@@ -101,7 +101,7 @@ class ExponentialSchedule(_AdaptiveSchedule):
 
 @dataclass
 class FixedSchedule:
-    """The same K at every iteration, and r = lambda / K.
+    """A fixed K at every iteration, and r = lambda / K.
 
     Args:
         views: K, views of an iteration.

@@ -1,4 +1,4 @@
-"""Which training views an iteration samples (paper section 3.4)."""
+"""Samplers of the training views of an iteration (paper section 3.4)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _uniforms(purpose: int, num_views: int, step: Step) -> np.ndarray:
 class RandomViewSampler:
     """Uniformly random views, none twice until nearly all have been seen, as in 3DGS.
 
-    They come from a shuffled stack. Drawn views leave it, and it is filled again when fewer than K are left.
+    Views come from a shuffled stack. Drawn views leave it, and it is filled again when fewer than K are left.
     """
 
     stack: np.ndarray = field(init=False, repr=False, compare=False)  # the views left, int64

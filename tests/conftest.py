@@ -1,5 +1,5 @@
-"""What all tests share. Imported by the process that starts the others as well, which needs neither torch nor ours: to
-import them there would keep all cores but one waiting."""
+"""Fixtures that all tests share. The process that starts the others imports this module too, and needs neither torch
+nor the package: importing them there would keep all cores but one waiting."""
 
 import gc
 import os
@@ -9,12 +9,11 @@ from pathlib import Path
 
 import pytest
 
-gc.set_threshold(10_000)  # of torch and the tests there are half a million objects, walked through again and again
+gc.set_threshold(10_000)  # torch and the tests make half a million objects, walked through at each collection
 
 
 def pytest_collection_modifyitems() -> None:
-    """In each process that runs tests. Their tensors are small: more threads gain nothing and collapse on a busy
-    machine."""
+    """Give each process that runs tests one thread: tensors are small, and more threads collapse on a busy machine."""
     import torch
 
     torch.set_num_threads(1)

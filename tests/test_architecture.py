@@ -67,7 +67,7 @@ def test_every_built_in_strategy_is_exported():
 
 
 def test_readmes_three_lines(tmp_path):
-    """As they stand there, on a smaller capture and for fewer iterations."""
+    """README's lines run as printed, on a smaller capture and for fewer iterations."""
     (block,) = re.findall(
         r"```python\nimport turbogs_plugin\n\n(scene = .*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S
     )

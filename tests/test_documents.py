@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from turbogs_plugin import cli
+from turbogs_plugin.commands import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -56,8 +56,8 @@ def test_commands_and_options_that_pages_name_are_there():
         text = re.sub(r"\\\n", "", page.read_text(encoding="utf-8"))
         for said in re.findall(r"\bturbogs ([a-z][^\n`#]*)", text):
             names, *_ = said.split()
-            wrong += [f"{page.name}: {said}"] if not set(names.split("|")) & set(cli.COMMANDS) else []
-            if names in cli.COMMANDS:
+            wrong += [f"{page.name}: {said}"] if not set(names.split("|")) & set(COMMANDS) else []
+            if names in COMMANDS:
                 options = re.findall(r"(?<![\w-])--(?:no-)?([a-z][\w-]*)", said)
                 wrong += [f"{page.name}: {said}: --{name}" for name in options if name.replace("-", "_") not in known]
     assert wrong == []

@@ -42,7 +42,7 @@ def capture(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def thin_capture(capture, tmp_path_factory) -> Path:
-    """The same with an eighth of the points."""
+    """The capture with an eighth of the points."""
     return thin_out_points(Path(shutil.copytree(capture, tmp_path_factory.mktemp("thin") / "demo")), 8)
 
 
@@ -201,7 +201,7 @@ def test_not_installed_it_is_not_known():
 
 
 def test_colmap_undistorts_to_the_cameras_and_pixels_that_loading_does(example, tmp_path):
-    """Of a capture with random points alone, which are then the same too."""
+    """A capture with random points alone keeps them, too."""
     folder = tmp_path / "raw"
     (folder / "images").mkdir(parents=True)
     y, x = np.mgrid[:120, :160]
@@ -225,7 +225,8 @@ def test_colmap_undistorts_to_the_cameras_and_pixels_that_loading_does(example, 
 
 
 def require_same_capture(loaded: Scene, plain: Scene) -> None:
-    """Of one lens: the same poses and points, focal lengths within 0.5 %, and what both see the same but for noise."""
+    """Captures of one lens have equal poses and points, focal lengths within 0.5 %, and equal pictures but for
+    noise."""
     assert plain.train.names == loaded.train.names and plain.test.names == loaded.test.names
     assert torch.allclose(plain.train.cameras.viewmats, loaded.train.cameras.viewmats, atol=1e-5)
     assert torch.allclose(plain.points, loaded.points, atol=1e-5)
@@ -283,7 +284,7 @@ def test_many_photos_are_a_capture_that_trains(example, tmp_path):
 
 
 def test_the_parts_that_the_page_prints_train(capture, tmp_path, monkeypatch):
-    """ "Your strategies in our trainer" of docs/drop-in.md; the loss's gradient is that of its value."""
+    """The parts of docs/drop-in.md ("Your strategies in our trainer") train; the loss's gradient is its value's."""
     page = (EXAMPLES.parent / "docs" / "drop-in.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"^```python\n(# my_parts.py\n.*?)^```$", page, re.DOTALL | re.MULTILINE)
     (settings,) = re.findall(r"^```yaml\n([^`]*my_parts:Huber.*?)^```$", page, re.DOTALL | re.MULTILINE)

@@ -1,7 +1,5 @@
 """Masks: the live tiles against plain numpy, and what every sampler makes of them."""
 
-import hashlib
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,7 @@ from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
-from turbogs_plugin.tiles import compact, dense_pixels, pixel_table
+from turbogs_plugin.tiles import compact, pixel_table
 from turbogs_plugin.types import TILE_SIZE, PixelSamples
 
 ONE_PIXEL, WHOLE, NOTHING = 0, 1, 2
@@ -166,31 +164,6 @@ def test_masked_pixels_have_no_part_in_means():
     maps.update(maps.masks.pixels((4, 0)), torch.ones(int(keep[4].sum()) + 1), step(0))
     np.testing.assert_allclose(maps.view_means(), [0.7, 0.5, 0.0, 0.5, 0.7], rtol=1e-3)
     assert (maps.errors[maps.offsets[4] :][~keep[4].reshape(-1)] == 0).all()
-
-
-BEFORE_MASKS = {
-    "pixel": ("4a00f6ccb61fa1da", "5eb3cb40ead87b29"),
-    "tile": ("4c43c8e8312d6f53", "eeb893a2b3f7c6d6"),
-}
-"""Digests of draws, error-guided and random, as they were before there were masks. Tiles: in iteration 0, as their grid
-moves later."""
-
-
-@pytest.mark.parametrize("unit", UNITS)
-def test_draws_without_masks_are_the_same_as_before_there_were_any(unit):
-    found, now = [], step(0 if unit == "tile" else 8, seed=1)
-    for sampler in (ErrorGuidedPixelSampler(unit=unit, importance=0.5), RandomPixelSampler(unit=unit)):
-        samples, digest = sampler.sample(random_maps(), (4, 0, 3), 0.2, now), hashlib.sha256()
-        for tensor in (samples.pixel_ids, samples.tile_ids, samples.tile_offsets):
-            digest.update(tensor.numpy().astype("<i4").tobytes())
-        found.append(digest.hexdigest()[:16])
-    assert tuple(found) == BEFORE_MASKS[unit]
-
-
-def test_whole_maps_are_as_without_masks():
-    assert random_maps().masks is None
-    samples = DensePixelSampler().sample(random_maps(), (4, 0), 1.0, step(0))
-    assert torch.equal(samples.pixel_ids, dense_pixels((4, 0), SIZES[[4, 0]], "cpu").pixel_ids)
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ def test_a_mask_that_does_not_fit_is_refused(mask, words):
 
 
 def test_selected_cameras_have_the_matrices_of_now():
-    """They follow what becomes of the cameras until then, and gradients."""
+    """Selected cameras follow changes of the cameras until then, and gradients."""
     cameras = make_cameras([(40, 30), (20, 20), (30, 50)])
     for change in range(3):
         if change == 1:

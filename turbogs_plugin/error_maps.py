@@ -1,8 +1,8 @@
 """Persistent error and age of every pixel of every training view (paper section 3.3).
 
 The maps of all views lie end to end in one array ("flat pixels"), so views may differ in size. For each pixel the
-iteration of its last visit is stored, its "stamp". This gives the same ages as the paper's counters, plus one, and only
-the sampled pixels have to be written. The sum of a view's errors is updated incrementally. Errors are stored in half
+iteration of its last visit is stored, its "stamp". Stamps give the ages of the paper's counters, plus one, and only the
+sampled pixels have to be written. The sum of a view's errors is updated incrementally. Errors are stored in half
 precision and their sums in double, so the sums are exact (below 2^29 a view) and do not drift.
 
 Without Gaussians, from plain error images::
@@ -78,7 +78,7 @@ class ErrorMaps:
         self.view_sums = torch.zeros(len(self.sizes), dtype=torch.float64, device=self.device)
         self._means = _LaggedCopy(self.view_sums, self.refresh)
         self._sums_read: np.ndarray | None = None
-        self._view_means = np.zeros(0)  # the latest means, and the sums that they are of
+        self._view_means = np.zeros(0)  # means of `_sums_read`
 
     def _allocate(self) -> None:
         self.offsets = np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1))])  # [V + 1]
@@ -122,7 +122,8 @@ class ErrorMaps:
     def fetch(self, view_ids: Sequence[int]) -> None:
         """Make the maps of these views available in `errors` and `stamps`, from `offsets` on.
 
-        Call it before reading or writing these arrays. Here all views are always there; see `scene/offload.py`.
+        Call it before reading or writing these arrays. All views are always there in `ErrorMaps`; see
+        `scene/offload.py`.
         """
 
     def flat_pixels(self, samples: PixelSamples) -> Tensor:
@@ -133,8 +134,8 @@ class ErrorMaps:
         """Set the errors of one whole view.
 
         Args:
-            errors: [H * W] float, detached here; non-finite ones and those below 0 count as zero, as do those of
-                masked pixels.
+            errors: [H * W] float, detached here; an error that is not finite, is below 0 or is a masked pixel's
+                counts as zero.
 
         Raises:
             InputError: another shape.
@@ -212,13 +213,13 @@ class ErrorMaps:
     def view_means(self) -> np.ndarray:
         """[V] float64 on the host: mean error of each view, over its pixels that are not masked; 0 if all are.
 
-        On the CPU they are exact. Elsewhere reading them at every call would stall the device, so a copy is started
-        at every `refresh`-th call and read at the next such call. So the means are between `refresh` and
+        On the CPU they are exact. Elsewhere reading them at every call would stall the device, so a copy is started at
+        every `refresh`-th call and read at the next such call. The means are therefore between `refresh` and
         ``2 * refresh - 1`` calls old (between 0 and ``2 * refresh - 1`` after the first call or `initialise`, which
         wait for the device). They depend on the number of calls alone, never on timing.
         """
         sums = self._means.read()
-        if sums is not self._sums_read:  # on a GPU they are the same for `refresh` calls
+        if sums is not self._sums_read:  # a GPU's sums change every `refresh` calls
             self._sums_read, self._view_means = sums, np.maximum(sums, 0.0) / self._pixel_counts
         return self._view_means.copy()
 

@@ -1,4 +1,4 @@
-"""What ends a command: the two exceptions that mean "your input" and "this run", and the exit codes."""
+"""Exceptions that end a command ("your input" and "this run"), and the exit codes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ class InputError(ValueError):
 class TrainingStopped(RuntimeError):
     """A run that cannot go on: one line that says at which iteration and why.
 
-    What the run saved before stays as it is. The command line prints it without a traceback and exits with code 1.
+    Files that the run saved before stay as they are. The command line prints the line without a traceback and exits
+    with code 1.
     """
 
 
@@ -47,7 +48,7 @@ def nearest(name: object, known: Iterable[str]) -> str:
 
 
 def refusal(error: OSError) -> str:
-    """What the system refused a file for, and what to do about it."""
+    """Reason for which the system refused a file, and the remedy."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         remedy = "choose another place or make room"
     elif isinstance(error, PermissionError):
@@ -60,7 +61,7 @@ def refusal(error: OSError) -> str:
 
 
 def error_line(error: Exception) -> str:
-    """What a user is told of an `InputError`, a `TrainingStopped` or an OSError: one line."""
+    """One line for the user about an `InputError`, a `TrainingStopped` or an OSError."""
     said = str(error)
     if isinstance(error, OSError):
         place = "the system says" if error.filename is None else f"'{error.filename}'"

@@ -22,13 +22,13 @@ PAUSE = 0.02
 
 
 def require_writable(folder: Path, given: str) -> None:
-    """Try whether a folder, or the nearest one above it that is there, takes new entries; nothing stays behind.
+    """Try to make an entry in a folder, or in the nearest one above it that is there; nothing stays behind.
 
     Args:
         given: what names the place, for the message.
 
     Raises:
-        InputError: it does not.
+        InputError: the folder takes no new entries.
     """
     place = folder.absolute()
     while not os.path.lexists(place):
@@ -129,12 +129,12 @@ def unused_name(name: str, taken: Container[str]) -> str:
 
 
 def partial_path(path: Path) -> Path:
-    """Where this process writes a file until it is complete."""
+    """Place where this process writes a file until it is complete."""
     return path.with_name(f"{_own_prefix(path)}{os.getpid()}.part")
 
 
 def _own_prefix(path: Path) -> str:
-    """How the names of a file's partial ones of this host begin."""
+    """Beginning of the names of a file's partial files that this host writes."""
     return f".{path.name}.{socket.gethostname()}."
 
 
@@ -155,8 +155,8 @@ def _sync_folder(folder: Path) -> None:
 
 
 def process_started(process: int) -> str:
-    """When a process of this host was started, which tells it from a later one of the same number; "gone" where there
-    is none, "" where nothing is known."""
+    """Start time of a process of this host, which tells it from a later process of its number; "gone" where there is
+    none, "" where nothing is known."""
     try:
         return Path(f"/proc/{process}/stat").read_text(errors="replace").rpartition(")")[2].split()[19]
     except (OSError, IndexError):

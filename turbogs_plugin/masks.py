@@ -1,8 +1,8 @@
-"""Which pixels of each view count: masks, as lists of the tiles that have a pixel left.
+"""Masks of the pixels that count in each view, as lists of the tiles that have a pixel left.
 
 A *live* tile has at least one pixel that is not masked. Draws go over live tiles alone, so the others cost nothing. A
-tile that the mask cuts has a bit for each of its pixels; all whole tiles share one row of bits. That is about an eighth
-of a byte a pixel or less, so masks stay on the device even where photos and error maps do not.
+tile that the mask cuts has a bit for each of its pixels; all whole tiles share one row of bits. Masks take an eighth of
+a byte a pixel or less, so they stay on the device even where photos and error maps do not.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class ViewMask:
         size: (width, height).
         tiles: [L] int32, number of each live tile within the view, ascending.
         cut: [L] bool, the mask takes pixels of the tile.
-        bits: [C, WORDS] int32, of the C tiles that are cut.
-        pixels: how many are not masked.
+        bits: [C, WORDS] int32, the bits of the C tiles that are cut.
+        pixels: number of pixels that are not masked.
     """
 
     size: tuple[int, int]
@@ -43,7 +43,7 @@ class ViewMask:
 
     @classmethod
     def of(cls, keep: np.ndarray) -> ViewMask:
-        """That of an image [H, W], in which True or nonzero pixels count."""
+        """The mask of an image [H, W], in which True or nonzero pixels count."""
         height, width = keep.shape
         rows, columns = -(-height // TILE_SIZE), -(-width // TILE_SIZE)
         padded = np.zeros((rows * TILE_SIZE, columns * TILE_SIZE), dtype=bool)
@@ -59,7 +59,7 @@ class ViewMask:
 
     @classmethod
     def whole(cls, size: tuple[int, int]) -> ViewMask:
-        """Of a view without a mask."""
+        """The mask of a view in which every pixel counts."""
         width, height = size
         tiles = np.arange(-(-width // TILE_SIZE) * -(-height // TILE_SIZE), dtype=np.int32)
         return cls(size, tiles, np.zeros(len(tiles), dtype=bool), np.zeros((0, WORDS), dtype=np.int32), width * height)
@@ -78,7 +78,7 @@ class PixelMasks:
         offsets: [V + 1] int64 numpy array, the first live tile of each view, and the count L of all.
         pixel_counts: [V] int64 numpy array, pixels of each view that are not masked.
         tiles: [L] int32, number of each live tile within its view, ascending in each.
-        rows: [L] int32, its row of `bits`; row 0 is that of all whole tiles.
+        rows: [L] int32, each live tile's row of `bits`; all whole tiles share row 0.
         bits: [B, WORDS] int32, see `WORDS`. Bits outside the image mean nothing.
     """
 
@@ -159,8 +159,8 @@ class PixelMasks:
         return PixelSamples(view_ids, sizes, table[live], tiles.int(), offsets.int(), has_empty_slots=False)
 
     def strip(self, samples: PixelSamples) -> PixelSamples:
-        """The samples without masked pixels, empty slots and tiles that have nothing left: those of a sampler that
-        knows no masks. Weights have a mean of 1 again. The host waits for the device."""
+        """Samples of a sampler that knows no masks, without masked pixels, empty slots and tiles with nothing left.
+        Weights have a mean of 1 again. The host waits for the device."""
         tiles, live = self.live_tiles(samples.view_ids)
         # A last row for tiles that are not live.
         tiles = torch.cat([tiles, tiles.new_full((1,), torch.iinfo(torch.int64).max)])

@@ -24,16 +24,16 @@ def _places(device: torch.device | str) -> tuple[Tensor, Tensor]:
 
 
 def slots_of_tiles(wanted: int, sizes: np.ndarray) -> np.ndarray:
-    """[T] int64: slots of each tile of ``TileGrid(sizes)``: so many pixels, or all that the tile has."""
+    """[T] int64: slots of each tile of ``TileGrid(sizes)``: `wanted` pixels, or all that the tile has."""
     return np.minimum(wanted, np.multiply(*tile_extents(sizes)))
 
 
 @dataclass(frozen=True)
 class DrawEnds:
-    """`PixelSamples.host_ends` of a draw whose sizes the host knows. Equal draws have equal ones.
+    """`PixelSamples.host_ends` of a draw whose sizes the host knows. Equal draws have equal ends.
 
     Args:
-        unit: of the draw, one of `layout.UNITS`.
+        unit: unit of the draw, one of `layout.UNITS`.
         sizes: K times (width, height).
         wanted: K times the units drawn of a view's tiles, or of each of its tiles.
         live: K times the tiles that are drawn from, where these are not all tiles: each then has as many slots as a
@@ -94,7 +94,7 @@ def compact(
     """Samples of the masked places of tiles, in the table's order, without counting on the device.
 
     Args:
-        view_ids, sizes, origin: of the batch, as in `PixelSamples`.
+        view_ids, sizes, origin: the batch, as in `PixelSamples`.
         table: [T, 256] int32 pixel ids.
         mask: [T, 256] bool, the places to keep: in each tile at most its count of slots; the others stay empty.
         tile_ids: [T] int32.
@@ -138,14 +138,14 @@ def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.devic
 
 @lru_cache(maxsize=32)
 def _dense_offsets(sizes_bytes: bytes, device: torch.device) -> Tensor:
-    """[T + 1] int32: first slot of each tile of dense views, `sizes_bytes` those of the [K, 2] int64 array. Kept, as
-    sending them anew would make every iteration of a dense trainer wait for the device."""
+    """[T + 1] int32: first slot of each tile of dense views; `sizes_bytes` are the bytes of the [K, 2] int64 sizes. The
+    result is kept, as sending it anew would make every iteration of a dense trainer wait for the device."""
     widths, heights = tile_extents(np.frombuffer(sizes_bytes, dtype=np.int64).reshape(-1, 2))
     return torch.as_tensor(np.concatenate([[0], np.cumsum(widths * heights)]), dtype=torch.int32, device=device)
 
 
 @lru_cache(maxsize=32)
 def _dense_view(width: int, height: int, device: torch.device) -> Tensor:
-    """[H * W] int32: the pixels of one image in the order of samples. Kept, as evaluations ask for the same again."""
+    """[H * W] int32: the pixels of one image in the order of samples. Kept, as evaluations ask for it again."""
     table = pixel_table(np.array([[width, height]]), device)
     return table[table >= 0]

@@ -1,1 +1,1 @@
-"""Where Gaussians are added and removed."""
+"""Density control: Gaussians are added and removed."""

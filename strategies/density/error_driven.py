@@ -21,7 +21,7 @@ FINAL_PRUNINGS = 3
 """Final prunings at most. The paper's runs of 5000 and 8000 iterations have two and three. A run that was made longer
 without what counts iterations would have dozens, and lose most of its model to them."""
 MOST_ROOM = 2.0
-"""Times its cap that a model may have while it grows, however much the final prunings remove."""
+"""Largest size of a growing model in times of its cap, however much the final prunings remove."""
 
 
 @dataclass
@@ -39,9 +39,9 @@ class ErrorDrivenDensity(WindowedDensity):
     chosen, be it to grow or to be removed.
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, one event clones, splits and
-    prunes. A Gaussian that is due for pruning is not densified. One that is too large is pruned unless it is split,
-    so also where the cap leaves no room to split it. Afterwards, every `final_every` iterations, an event only prunes.
-    At least one Gaussian is always left.
+    prunes. A Gaussian that is due for pruning is not densified. A Gaussian that is too large is pruned unless it is
+    split, also where the cap leaves no room to split it. Afterwards, every `final_every` iterations, an event only
+    prunes. At least one Gaussian is always left.
 
     Args:
         lambda_base: weight of the distance term in the score; 0.8 in the paper.
@@ -72,18 +72,19 @@ class ErrorDrivenDensity(WindowedDensity):
         opacity_decay: share of its opacity that every Gaussian loses at each densification event. If the photos need
             it, it grows back; if not, it falls below `prune_opacity`. A gentle substitute for 3DGS's reset.
         spare_beyond: distance from the cameras' centre, in scene extents, beyond which Gaussians are neither decayed
-            nor pruned (unless they are not finite, or `max_gaussians` leaves no other choice). It protects a backdrop
-            behind the scene, which few photos see. 0: none.
+            nor pruned (unless they are not finite, or `max_gaussians` leaves no other choice). The distance protects a
+            backdrop behind the scene, which few photos see. 0: none.
         choose_by: rule by which Gaussians grow and are removed. `difficulty`, the paper's: all grow that pass the
             thresholds, or the most difficult of them where `max_gaussians` has no room for all; the easiest are removed
-            first. `squares` (see `growth`): as many grow as pass the threshold of the absolute gradient; which ones
-            is drawn at random among those seen, in proportion to their squares. Those with the least squares are
+            first. `squares` (see `growth`): as many grow as pass the threshold of the absolute gradient; which ones is
+            drawn at random among those seen, in proportion to their squares. Gaussians with the least squares are
             removed first. `grad_threshold`, `top_fraction`, `score` and `lambda_base` then mean nothing.
         final_every: interval of the final pruning, Delta_prune; 500 in the paper. There are `FINAL_PRUNINGS` at most,
             the last one half an interval or more before the end.
         final_keep: share of the Gaussians, seen and not spared, that a final pruning keeps, eta_final; 0.8 .. 0.95 in
             the paper. 1 keeps all.
-        prune_opacity: opacity below which Gaussians are pruned. This and the following are 3DGS's values, no settings.
+        prune_opacity: opacity below which Gaussians are pruned. The value and the following ones are 3DGS's, no
+            settings.
         prune_world_size: largest standard deviation of a Gaussian over `prune_world_reference`. 0: off.
         prune_screen_size: largest screen radius of a Gaussian over the larger side of the image. 0: off; 3DGS has such
             a rule, which never takes effect there.
@@ -149,7 +150,7 @@ class ErrorDrivenDensity(WindowedDensity):
         return errors + self.lambda_base * step.anneal * distances, seen
 
     def due(self, step: Step) -> tuple[bool, bool]:
-        """Whether this iteration densifies, and whether it makes a final pruning."""
+        """(densifies, prunes finally): the two kinds of event at this iteration."""
         iteration, after = step.iteration, step.iteration - step.refine_until
         densify = after <= 0 and iteration >= self.refine_from and iteration % self.refine_every == 0
         final = 0 < after <= self._final_prunings(step) * self.final_every and after % self.final_every == 0
@@ -162,18 +163,18 @@ class ErrorDrivenDensity(WindowedDensity):
         return 1 / max(1 / MOST_ROOM, self.final_keep ** self._final_prunings_left(step))
 
     def bound(self, step: Step) -> int:
-        """Most Gaussians after an event at this iteration; 0: any number. What is grown beyond the cap and then removed
-        by worth makes a better model of as many Gaussians than what never was beyond it (docs/lab/tried.md)."""
+        """Most Gaussians after an event at this iteration; 0: any number. A model that grew beyond its cap and was then
+        reduced by worth is better than one of its size that never was beyond (docs/lab/tried.md)."""
         return math.floor(self.max_gaussians * self.growth_room(step) + 1e-6)
 
     def _reduction_due(self, step: Step) -> bool:
-        """Whether a model beyond its bound is reduced: after densification, where a time budget has made the run too
-        short for a final pruning that was counted on."""
+        """A model beyond its bound is reduced at this iteration: after densification, where a time budget has made the
+        run too short for a final pruning that was counted on."""
         after = step.iteration > step.refine_until and step.iteration % self.refine_every == 0
         return after and self.max_gaussians > 0 and self._stats is not None
 
     def _last_event(self, step: Step) -> int:
-        """Iteration after which no statistics are needed: that of the last event, or where densification ends.
+        """Iteration after which no statistics are needed: the last event's, or the end of densification.
 
         Not the iteration of the last densification: a time budget may still move `refine_until` and make room for
         another one.
@@ -181,13 +182,13 @@ class ErrorDrivenDensity(WindowedDensity):
         return step.refine_until + self._final_prunings(step) * self.final_every
 
     def _final_prunings(self, step: Step) -> int:
-        """How many the run has."""
+        """Number of final prunings of the run."""
         # Half an interval at least is left after the last, so that a length which is off by a few has as many.
         fitting = math.floor((step.total - step.refine_until) / self.final_every - 0.5)
         return min(FINAL_PRUNINGS, max(0, fitting)) if self.final_keep < 1 else 0
 
     def _final_prunings_left(self, step: Step) -> int:
-        """How many come after this iteration."""
+        """Number of final prunings after this iteration."""
         over = max(0, step.iteration - step.refine_until) // self.final_every
         return max(0, self._final_prunings(step) - over)
 
@@ -250,7 +251,7 @@ class ErrorDrivenDensity(WindowedDensity):
         return oversized
 
     def _worth(self, step: Step) -> tuple[Tensor, Tensor, Tensor]:
-        """([N] worth, [N] bool where it is known, [N] bool seen). What is worth less is removed sooner.
+        """([N] worth, [N] bool where it is known, [N] bool seen). Gaussians that are worth less are removed sooner.
 
         Worth is the score, or the squares. A Gaussian that was not seen has no known score; its squares are 0, so by
         squares it is worth least.
@@ -278,7 +279,7 @@ class ErrorDrivenDensity(WindowedDensity):
     def _within_bound(
         self, kept: Tensor, count: int, worth: Tensor, known: Tensor, spared: Tensor, step: Step
     ) -> Tensor:
-        """[N] bool, which of the `count` that would be kept are: not those of least worth, if the cap allows fewer."""
+        """[N] bool: the `count` Gaussians of `kept`, without the ones of least worth where the cap allows fewer."""
         excess = count - self.bound(step) if self.max_gaussians > 0 else 0
         return kept & ~_least(worth, known, kept, spared, excess) if excess > 0 else kept
 
@@ -309,7 +310,7 @@ class ErrorDrivenDensity(WindowedDensity):
 def _quantile(values: Tensor, mask: Tensor, fraction: float) -> Tensor:
     """The value at rank ``floor(fraction * n)`` of the n masked values [N] in ascending order; 0 if there are none.
 
-    So many values, or fewer in case of ties, are less than it.
+    At most ``floor(fraction * n)`` values are less than it, fewer in case of ties.
     """
     chosen = values[mask]
     if len(chosen) == 0:

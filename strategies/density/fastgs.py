@@ -32,7 +32,7 @@ BLAME_THRESHOLD = 0.9
 
 @dataclass
 class ViewVotes:
-    """What the batches of a window say about each Gaussian, [N] float32 each. A batch is the views of one iteration.
+    """Votes of a window's batches about each Gaussian, [N] float32 each. A batch is the views of one iteration.
 
     Args:
         seen: number of batches in which the Gaussian had weight.
@@ -66,17 +66,17 @@ class FastGsDensity(DensityController):
 
     FastGS renders some training views in full at each event, marks the pixels of large (normalised) error, and scores
     each Gaussian by the marked pixels in its footprint. For densification the score is their mean number over the
-    views; for pruning it is their number times each view's photometric error, normalised. This class keeps these two
-    ideas without the extra renders: an event uses the batches of the iterations since the last event. In a batch, a
+    views; for pruning it is their number times each view's photometric error, normalised. `FastGsDensity` keeps these
+    two ideas without the extra renders: an event uses the batches of the iterations since the last event. In a batch, a
     Gaussian is *marked* if its mean error, sum of e * w over sum of w, exceeds `ERROR_THRESHOLD` times the batch's mean
     error. In ``configs/fastgs.yaml`` a batch is one view.
 
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, a Gaussian is cloned or split
     where its screen gradient, or its absolute one, passes the threshold *and* at least `CONSISTENCY` of the batches
     that saw it marked it. Transparent and huge ones are pruned. Afterwards, every `PRUNE_EVERY` intervals, transparent
-    ones are pruned. So are those whose blame (the sum of the mean errors of the batches that marked them) exceeds
-    `BLAME_THRESHOLD` of the largest, unless all have that much. Both kinds of event prune Gaussians that are not
-    finite. One Gaussian is always left.
+    ones are pruned. Gaussians are pruned, too, whose blame (the sum of the mean errors of the batches that marked them)
+    exceeds `BLAME_THRESHOLD` of the largest, unless all have that much. Both kinds of event prune Gaussians that are
+    not finite. One Gaussian is always left.
 
     Args:
         refine_from: first iteration of densification.

@@ -2,8 +2,8 @@
 
 The *squares* of a Gaussian, `GaussianStats.square_sums`, are the sum over the window's samples of (o * d loss / d o)^2,
 o its opacity. The sum stays large where some samples want a Gaussian more opaque and others less, where the gradient
-itself cancels: one Gaussian cannot serve both. It is near 0 where a Gaussian makes no difference. LiteGS scores growth
-by the variance of the same gradient.
+itself cancels: one Gaussian cannot serve both. The sum is near 0 where a Gaussian makes no difference. LiteGS scores
+growth by the variance of the same gradient.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def drawn_by_squares(stats: GaussianStats, step: Step) -> Tensor:
 
 
 def squares_of(stats: GaussianStats) -> tuple[Tensor, Tensor]:
-    """([N] sums of squares, 0 where not finite; [N] bool, which are finite). What was not seen has 0."""
+    """([N] sums of squares, 0 where not finite; [N] bool, which are finite). A Gaussian that was not seen has 0."""
     return stats.square_sums.nan_to_num(0.0, 0.0, 0.0), torch.isfinite(stats.square_sums)
 
 

@@ -27,9 +27,9 @@ class _FilledStrategy(DefaultStrategy):
 class GsplatDefaultDensity(WindowedDensity):
     """gsplat's own clone, split, prune and reset, run on our parameters and statistics.
 
-    gsplat changes parameters and optimizer state together. Here it gets the parameters, optimizers whose only state
+    gsplat changes parameters and optimizer state together. Here gsplat gets the parameters, optimizers whose only state
     marks the rows that gsplat makes or resets, and the row numbers as one more running statistic. The result is a
-    `RowUpdate`. It stops at `Step.refine_until` (gsplat's `refine_stop_iter`).
+    `RowUpdate`. Events end at `Step.refine_until` (gsplat's `refine_stop_iter`).
 
     An event first removes Gaussians that are not finite or too large to be split, on which gsplat would fail or go on
     training with NaN. One Gaussian, the most opaque, is always left.
@@ -93,7 +93,7 @@ class GsplatDefaultDensity(WindowedDensity):
         return removal(leave_one(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians))
 
     def _change(self, gaussians: Gaussians, params: dict, optimizers: dict, state: dict) -> RowUpdate | None:
-        """What gsplat has changed, as a `RowUpdate`."""
+        """The change that gsplat has made, as a `RowUpdate`."""
         source = state["source_row"]
         fresh, opacity_fresh = (new_rows(params, optimizers, name) for name in ("means", "opacities"))
         was_reset = bool(opacity_fresh.all()) and not bool(fresh.all())

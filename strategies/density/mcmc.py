@@ -28,7 +28,7 @@ class GsplatMcmcDensity(DensityController):
     """gsplat's relocation, growth and noise (Kheradmand et al. 2024), run on our parameters.
 
     The noise on the means, which is part of every iteration, is added in place. The method's dead Gaussians come from
-    terms of opacity and scale in the objective (0.01 each in gsplat's trainer). Here these are `DenseAdam`'s
+    terms of opacity and scale in the objective (0.01 each in gsplat's trainer). Here the terms are `DenseAdam`'s
     `opacity_reg` and `scale_reg`, which ``configs/mcmc.yaml`` sets. Relocation and growth stop at `Step.refine_until`
     (gsplat's `refine_stop_iter`).
 

@@ -1,17 +1,41 @@
-"""Functions for density controllers: statistics of a window, finite Gaussians, one that always stays, a removal."""
+"""Parts of density controllers (statistics of a window, finite Gaussians, one that always stays, a removal), and the
+controller that changes nothing.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.protocols import DensityController
-from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate
+from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 RowsType = TypeVar("RowsType")  # a dataclass of [N] tensors
+
+
+@dataclass
+class NoDensity(DensityController):
+    """The set of Gaussians stays as it is.
+
+    Args:
+        max_gaussians: most initial Gaussians. 0: no cap.
+    """
+
+    max_gaussians: int = 0
+
+    def __post_init__(self) -> None:
+        require_settings(self)
+
+    def event_due(self, step: Step) -> bool:
+        return False
+
+    def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
+        return None
 
 
 class WindowedDensity(DensityController):
@@ -47,7 +71,7 @@ class WindowedDensity(DensityController):
 
 
 def add_stats(window: GaussianStats, new: GaussianStats) -> None:
-    """Add statistics to those of a window, in place."""
+    """Add statistics to a window's sums, in place."""
     for name, value in vars(new).items():
         total = getattr(window, name)
         if name == "max_radii":
@@ -57,7 +81,7 @@ def add_stats(window: GaussianStats, new: GaussianStats) -> None:
 
 
 def saved_rows(rows: RowsType | None) -> dict[str, Tensor] | None:
-    """What `loaded_rows` takes: name of a field -> [N], or None."""
+    """The state that `loaded_rows` takes: name of a field -> [N], or None."""
     return None if rows is None else dict(vars(rows))
 
 

@@ -1,1 +1,1 @@
-"""How gradients become steps of the parameters."""
+"""Optimizers: gradients become steps of the parameters."""

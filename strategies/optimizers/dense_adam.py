@@ -24,7 +24,7 @@ OPTIONS |= {"weight_decay": 0.0, "amsgrad": False, "maximize": False}
 class DenseAdam:
     """Adam (Kingma & Ba 2015) by torch's own fused kernels, on all N Gaussians.
 
-    What differs from `SparseAdam`:
+    Differences from `SparseAdam`:
 
     - a Gaussian that no sample touched has a gradient of zero: its moments decay, and its momentum still moves it;
     - the bias correction counts iterations of the run, not updates of the Gaussian and those it was made of.
@@ -34,7 +34,7 @@ class DenseAdam:
     hundred.
 
     Two things differ from `torch.optim.Adam`. An iteration whose samples touched nothing changes nothing; on the GPU,
-    iterations that will be repeated are of this kind too. And a Gaussian with a non-finite gradient is treated as
+    iterations that will be repeated are of this kind too. A Gaussian with a non-finite gradient is treated as
     untouched, and counted.
 
     Args:

@@ -23,19 +23,20 @@ class MomentLMOptimizer(SparseAdam):
     A loss c times as large (c L_k, c g_k) gives the same delta. Without rows delta is exactly Adam's step. Where the
     views' gradients agree that Adam's step would take off more loss than there is, delta is shorter.
 
-    This needs shares and gradients of the same loss. The renderers give as L_k (`GaussianGradients.view_losses`) the
+    The system needs shares and gradients of one loss. The renderers give as L_k (`GaussianGradients.view_losses`) the
     share of the L1 error, summed over the three channels and averaged over the samples, whatever the loss. Two things
     follow. Our losses are means over channels too, so L_k is 3 times their share, and `curvature` acts as a third of
-    itself. And if only the loss is multiplied by c (a sum instead of a mean, loss scaling), the rows' term grows by c
+    itself. If only the loss is multiplied by c (a sum instead of a mean, loss scaling), the rows' term grows by c
     relative to Adam's, which shortens the steps where c > 1.
 
     `units: paper` is the printed equation, (J^T J + diag(sqrt(v) + eps)) delta = -m, with m and v uncorrected and the
-    g_k as rows of J. It has no learning rate and depends on the unit of the loss. It is there for comparison.
+    g_k as rows of J. The printed equation has no learning rate and depends on the unit of the loss; `paper` is there
+    for comparison.
 
     Args:
-        eps: added to sqrt(v); no setting. So small that a loss scaled by 1e-6 gives the same steps down to gradients
-            of 1e-12. It is not below what v can hold: where g^2 underflows in float32 (|g| < 1.2e-21), m / eps is still
-            less than one.
+        eps: added to sqrt(v); no setting. A loss scaled by 1e-6 then gives equal steps down to gradients of 1e-12. The
+            value is not below what v can hold: where g^2 underflows in float32 (|g| < 1.2e-21), m / eps is still less
+            than one.
         units: the system that is solved, `balanced` or the printed one, `paper`.
         rows: rows of J: one per view, or one, their sum (rank 1).
         curvature: weight of the rows' term. If L_k were true shares, 1/2 would be Gauss-Newton for a loss r^2 / 2, and

@@ -18,8 +18,8 @@ from turbogs_plugin.types import GaussianGradients, Gaussians, RowUpdate, Step
 class SparseAdam:
     """Adam (Kingma & Ba 2015) that leaves alone the Gaussians that no sampled pixel saw.
 
-    A Gaussian that no sample touched keeps its parameters, moments and step count, so momentum does not move it. One
-    with a non-finite gradient is left alone too, and counted.
+    A Gaussian that no sample touched keeps its parameters, moments and step count, so momentum does not move it. A
+    Gaussian with a non-finite gradient is left alone too, and counted.
 
     An optimizer with another `rule` on the same moments inherits from this one, as `MomentLMOptimizer` does.
 

@@ -1,56 +1,40 @@
-"""Options of gsplat's trainer beside each swap: each works, or is refused by a line that names it."""
-
-import re
-from collections.abc import Callable
-from dataclasses import dataclass
+"""Options of gsplat's trainer that change a render or its errors work beside the swaps."""
 
 import gsplat
 import pytest
 import torch
-from gsplat import DefaultStrategy
 from helpers.bridge_host import HEIGHT, WIDTH, Host, arguments, make_cameras, make_splats
 from helpers.gsplat_stand_ins import CAMERAS, COUNT, rendered_info, stand_in, stock_info
-from torch import distributed
-from torch.testing._internal.distributed.fake_pg import FakeStore
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import (
-    SharedOptimizer,
     TurboDensityStrategy,
     gather_pixels,
-    maps_of_photos,
     sparse_loss,
     sparse_rasterization,
 )
-from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, loss_shares
+from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
-from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
 from turbogs_plugin.types import Step
 
 
-def stock(monkeypatch, packed: bool = False, **changes) -> dict:
+def stock(monkeypatch) -> dict:
     """`info` of gsplat's own rasterizer with errors in it, after backward; its compositor is a stand-in."""
-    info, camera_of = stock_info(rendered_info(), packed)
+    info, camera_of = stock_info(rendered_info(), packed=False)
     monkeypatch.setattr(gsplat, "rasterize_to_pixels", stand_in(camera_of))
-    return {**info, **changes}
+    return info
 
 
-def densified(info: dict, absgrad: bool = True) -> None:
+def densified(info: dict) -> None:
     """A refinement by this `info`, which changes the Gaussians."""
-    host = Host(TurboDensityStrategy(refine_start_iter=0, refine_every=1, grow_grad2d=1e-6, absgrad=absgrad))
+    host = Host(TurboDensityStrategy(refine_start_iter=0, refine_every=1, grow_grad2d=1e-6))
     host.strategy.step_post_backward(host.splats, host.optimizers, host.state, 1, info)
     assert host.state["driven_by"] == "error" and len(host.splats["means"]) > 40
 
 
-def density_packed(monkeypatch):
-    densified(stock(monkeypatch, packed=True))
-
-
-def density_antialiased(monkeypatch):
-    """Opacities in `info` are the compensated ones; the weights are theirs, not those of the parameters."""
+def test_weights_are_of_the_compensated_opacities_of_an_antialiased_render(monkeypatch):
     plain, faint = stock(monkeypatch), stock(monkeypatch)
     faint["opacities"] = 0.25 * faint["opacities"].detach()
     plain_sum, faint_sum = (iteration_stats(info, COUNT)[0].weight_sums.sum() for info in (plain, faint))
@@ -58,49 +42,23 @@ def density_antialiased(monkeypatch):
     densified(faint)
 
 
-def density_absgrad(monkeypatch):
+@pytest.mark.parametrize("option", ["bilateral_grid", "random_bkgd", "RGB+D"])
+def test_a_prediction_that_the_host_changed_still_drives_density(monkeypatch, option):
     info = stock(monkeypatch)
-    densified(info)
-    densified(info, absgrad=False)
-    del info["means2d"].absgrad
-    with pytest.raises(InputError, match="render with absgrad=True"):
-        densified(info)
+    seen = info["prediction"]
+    with_depth = torch.cat([seen, seen[..., :1]], dim=-1)
+    if option == "RGB+D":
+        with pytest.raises(InputError, match=r"expected both \[C, H, W, 3\]"):
+            densified({**info, "prediction": with_depth})
+    changed = {
+        "bilateral_grid": seen @ torch.diag(torch.tensor([1.1, 0.9, 1.0])),
+        "random_bkgd": seen + torch.tensor([0.1, 0.2, 0.3]),
+        "RGB+D": with_depth[..., :3],
+    }
+    densified({**info, "prediction": changed[option]})
 
 
-def density_as_stock(monkeypatch):
-    """Options that only another camera, other parameters or another optimizer have to do with."""
-    densified(stock(monkeypatch))
-
-
-def density_app_opt(monkeypatch):
-    info, host = stock(monkeypatch), Host(TurboDensityStrategy(refine_start_iter=0, refine_every=1, grow_grad2d=1e-6))
-    splats = torch.nn.ParameterDict({name: host.splats[name] for name in ("means", "scales", "quats", "opacities")})
-    splats |= {name: torch.nn.Parameter(torch.zeros(40, 4)) for name in ("features", "colors")}
-    optimizers = {name: torch.optim.Adam([splats[name]]) for name in splats}
-    host.strategy.step_post_backward(splats, optimizers, host.state, 1, info)
-    assert len(splats["features"]) == len(splats["means"]) > 40
-
-
-def density_depth(monkeypatch):
-    info = stock(monkeypatch)
-    with_depth = torch.cat([info["prediction"], info["prediction"][..., :1]], dim=-1)
-    with pytest.raises(InputError, match=r"expected both \[C, H, W, 3\]"):
-        densified({**info, "prediction": with_depth})
-    densified({**info, "prediction": with_depth[..., :3]})
-
-
-def density_bilateral_grid(monkeypatch):
-    info = stock(monkeypatch)
-    densified({**info, "prediction": info["prediction"] @ torch.diag(torch.tensor([1.1, 0.9, 1.0]))})
-
-
-def density_with_ut(monkeypatch):
-    host = Host(TurboDensityStrategy())
-    host.strategy.step_pre_backward(host.splats, host.optimizers, host.state, 0, {"means2d": torch.zeros(1, 40, 2)})
-
-
-def density_patch_size(monkeypatch):
-    """Another part of another image at each step."""
+def test_patches_of_another_image_at_each_step():
     host = Host(TurboDensityStrategy(refine_start_iter=1, refine_every=2, grow_grad2d=1e-6))
     for step in range(3):
         host.cameras.Ks = host.cameras.Ks.clone()
@@ -109,21 +67,14 @@ def density_patch_size(monkeypatch):
     assert len(host.splats["means"]) != 40
 
 
-MASKS = (torch.arange(WIDTH) < WIDTH // 3).expand(CAMERAS, HEIGHT, WIDTH)
-"""True where a pixel counts."""
-
-
-def masked(info: dict) -> dict:
-    """As gsplat's trainer leaves it: the render is black where it is masked."""
-    return {**info, "prediction": info["prediction"] * MASKS[..., None]}
-
-
-def density_masks(monkeypatch):
-    """The errors are those of the pixels that count, where the photo is black too; else those of a black render."""
-    whole, black = masked(stock(monkeypatch)), masked(stock(monkeypatch))
-    black["ground_truth"] = black["ground_truth"] * MASKS[..., None]
-    expected = stock(monkeypatch)
-    errors = MASKS[..., None] * (expected["prediction"] - expected["ground_truth"])
+def test_errors_of_masked_pixels_count_unless_the_photo_is_black_there_too(monkeypatch):
+    """gsplat's trainer leaves the render black where it is masked."""
+    counts = (torch.arange(WIDTH) < WIDTH // 3)[:, None]  # [W, 1] True where a pixel counts
+    whole, black, expected = (stock(monkeypatch) for _ in range(3))
+    for info in (whole, black):
+        info["prediction"] = info["prediction"] * counts
+    black["ground_truth"] = black["ground_truth"] * counts
+    errors = counts * (expected["prediction"] - expected["ground_truth"])
     expected |= {"prediction": errors, "ground_truth": torch.zeros_like(errors)}
     sums = [iteration_stats(info, COUNT)[0].error_sums for info in (whole, black, expected)]
     torch.testing.assert_close(sums[1], sums[2])
@@ -131,216 +82,24 @@ def density_masks(monkeypatch):
     densified(black)
 
 
-def density_random_bkgd(monkeypatch):
-    info = stock(monkeypatch)
-    densified({**info, "prediction": info["prediction"] + torch.tensor([0.1, 0.2, 0.3])})
+def test_a_render_whose_screen_means_take_no_gradient_is_refused():
+    host = Host(TurboDensityStrategy())
+    with pytest.raises(InputError, match="takes no gradient, as from a render with with_ut"):
+        host.strategy.step_pre_backward(host.splats, host.optimizers, host.state, 0, {"means2d": torch.zeros(1, 40, 2)})
 
 
-def density_several(monkeypatch):
-    with several_processes():
-        TurboDensityStrategy().step_post_backward({}, {}, {}, 0, {})
-
-
-class several_processes:
-    def __enter__(self):
-        distributed.init_process_group("fake", store=FakeStore(), rank=0, world_size=2)
-
-    def __exit__(self, *_):
-        distributed.destroy_process_group()
-
-
-def lm_host() -> Host:
-    return Host(DefaultStrategy(), SharedOptimizer(MomentLMOptimizer()))
-
-
-def trained(host: Host, info: dict) -> None:
-    """A step of LM by the shares that `info` has moves every parameter that has a gradient."""
-    before = {name: value.detach().clone() for name, value in host.splats.items()}
-    assert loss_shares(info, COUNT).any()
-    for name, parameter in host.splats.items():
-        host.optimizers[name].observe(info)
-        parameter.grad = torch.ones_like(parameter)
-    for optimizer in host.optimizers.values():
-        optimizer.step()
-    assert all(not torch.equal(value, before[name]) for name, value in host.splats.items())
-
-
-def optimizer_packed(monkeypatch):
-    trained(lm_host(), stock(monkeypatch, packed=True))
-
-
-def optimizer_as_stock(monkeypatch):
-    trained(lm_host(), stock(monkeypatch))
-
-
-def optimizer_beside_another(monkeypatch):
-    """What is learnt beside the Gaussians has an optimizer of its own."""
-    poses = torch.nn.Embedding(3, 9)
-    own, host = torch.optim.Adam(poses.parameters(), lr=1e-2), lm_host()
-    before = poses.weight.detach().clone()
-    poses(torch.tensor([1])).sum().backward()
-    own.step()
-    trained(host, stock(monkeypatch))
-    assert not torch.equal(poses.weight, before)
-
-
-def optimizer_sparse_grad(monkeypatch):
-    host = lm_host()
-    host.splats["means"].grad = torch.sparse_coo_tensor([[0]], torch.ones(1, 3), (40, 3), check_invariants=True)
-    host.optimizers["means"].step()
-
-
-def optimizer_visible_adam(monkeypatch):
-    lm_host().optimizers["means"].step(torch.ones(40, dtype=torch.bool))
-
-
-def optimizer_app_opt(monkeypatch):
-    features = torch.nn.Parameter(torch.zeros(40, 32))
-    SharedOptimizer(SparseAdam())([{"params": features, "lr": 1e-3, "name": "features"}])
-
-
-def optimizer_with_ut(monkeypatch):
-    Host(DefaultStrategy(), SharedOptimizer(MomentLMOptimizer())).step(0)  # without errors: Adam's steps
-    info = stock(monkeypatch)
-    info["means2d"] = info["means2d"].detach()
-    with pytest.raises(InputError, match="takes no gradient"):
-        trained(lm_host(), info)
-
-
-def optimizer_masks(monkeypatch):
-    trained(lm_host(), masked(stock(monkeypatch)))
-
-
-def optimizer_several(monkeypatch):
-    with several_processes():
-        SharedOptimizer(SparseAdam())([])
-
-
-@dataclass
-class Sparse:
-    """A batch of sparse pixels and what is rendered of it."""
-
-    def __post_init__(self) -> None:
-        self.splats, self.cameras = make_splats(), make_cameras(CAMERAS)
-        maps = ErrorMaps(self.cameras.sizes, "cpu")
-        self.samples = RandomPixelSampler().sample(maps, (0, 1), 0.3, Step(0, 9, 9))
-        self.images = torch.rand(CAMERAS, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
-
-    def render(self, **options):
-        given = {"sh_degree": 1, **arguments(self.splats, self.cameras), **options}
-        return sparse_rasterization(**given, samples=self.samples)
-
-    def train(self, colors: torch.Tensor) -> None:
-        targets = gather_pixels(self.images, self.samples)
-        sparse_loss(CharbonnierNccLoss(), colors, targets, self.samples).backward()
-        assert all(value.grad.any() and value.grad.isfinite().all() for value in self.splats.values())
-
-
-def sparse_with(**options) -> Callable:
-    return lambda monkeypatch: Sparse().render(**options)
-
-
-def sparse_absgrad(monkeypatch):
-    sparse = Sparse()
-    colors, _, info = sparse.render(absgrad=True)
-    sparse.train(colors)
-    assert info["means2d"].absgrad.any()
-
-
-def sparse_visible_adam(monkeypatch):
-    """Its mask of visible Gaussians is taken from the radii in `info`."""
-    _, _, info = Sparse().render()
-    visible = (info["radii"] > 0).all(-1).any(0)
-    assert visible.shape == (40,) and visible.any()
-
-
-def sparse_depth(monkeypatch):
-    sparse = Sparse()
-    rendered, _, _ = sparse.render(render_mode="RGB+ED")
-    colors, depths = rendered[:, :3], rendered[:, 3:]
-    (depths - 3.0).abs().mean().backward(retain_graph=False, inputs=[sparse.splats["opacities"]])
-    assert sparse.splats["opacities"].grad.any() and colors.shape == (len(sparse.samples), 3)
-
-
-def sparse_pose(monkeypatch):
-    sparse = Sparse()
-    sparse.render(viewmats=sparse.cameras.viewmats @ torch.eye(4).requires_grad_())
-
-
-def sparse_app_opt(monkeypatch):
-    """Colours of an image: [C, N, 3]."""
-    Sparse().render(colors=torch.rand(CAMERAS, 40, 3), sh_degree=None)
-
-
-def sparse_bilateral_grid(monkeypatch):
-    """A gain for each view and place, learnt: what a bilateral grid is, at the samples."""
-    sparse = Sparse()
-    colors, _, _ = sparse.render()
-    grid = torch.ones(CAMERAS, 3, HEIGHT // 8, WIDTH // 8, requires_grad=True)
-    x, y = sparse.samples.coordinates().unbind(dim=-1)
-    gains = grid[sparse.samples.view_of_slot(), :, y // 8, x // 8]  # [P, 3]
-    sparse.train(colors * gains)
-    assert grid.grad.any()
-
-
-def sparse_patch_size(monkeypatch):
-    class Patches(list):
-        patch_size = 16
-
-    maps_of_photos(Patches([{"image": torch.zeros(16, 16, 3)}]))
-
-
-def sparse_masks(monkeypatch):
-    sparse = Sparse()
-    maps = maps_of_photos([{"image": sparse.images[view], "mask": MASKS[view]} for view in range(CAMERAS)], white=1.0)
-    sparse.samples = RandomPixelSampler().sample(maps, (0, 1), 0.3, Step(0, 9, 9))
-    assert (sparse.samples.coordinates()[sparse.samples.filled, 0] < WIDTH // 3).all()
-    sparse.train(sparse.render()[0])
-
-
-def sparse_random_bkgd(monkeypatch):
-    """As the trainer adds it: one colour for all views."""
-    sparse = Sparse()
-    colors, alphas, _ = sparse.render()
-    sparse.train(colors + torch.rand(1, 3) * (1.0 - alphas))
-
-
-def sparse_several(monkeypatch):
-    with several_processes():
-        Sparse().render()
-
-
-WORKS = (
-    *(density_as_stock, density_packed, density_antialiased, density_absgrad, density_depth, density_app_opt),
-    *(density_bilateral_grid, density_patch_size, density_masks, density_random_bkgd),
-    *(optimizer_as_stock, optimizer_packed, optimizer_beside_another, optimizer_with_ut, optimizer_masks),
-    *(sparse_absgrad, sparse_visible_adam, sparse_depth, sparse_bilateral_grid, sparse_masks, sparse_random_bkgd),
-)
-REFUSED = [
-    (sparse_with(packed=True), "packed=True is not supported"),
-    (sparse_with(rasterize_mode="antialiased"), "rasterize_mode='antialiased' is not supported"),
-    (sparse_with(sparse_grad=True), "sparse_grad=True is not supported"),
-    (sparse_with(with_ut=True), "with_ut=True is not supported"),
-    (sparse_with(camera_model="fisheye"), "camera_model='fisheye' is not supported"),
-    (sparse_pose, "viewmats requires a gradient"),
-    (sparse_app_opt, "expected [N, 3] without sh_degree"),
-    (sparse_patch_size, "needs whole images"),
-    (sparse_several, "sparse_rasterization works in one process"),
-    (optimizer_sparse_grad, "expected a dense one (sparse_grad=False)"),
-    (optimizer_visible_adam, "set visible_adam=False"),
-    (optimizer_app_opt, "takes one group with a 'name' among means"),
-    (optimizer_several, "SharedOptimizer works in one process"),
-    (density_with_ut, "takes no gradient, as from a render with with_ut"),
-    (density_several, "TurboDensityStrategy works in one process"),
-]
-
-
-@pytest.mark.parametrize("check", WORKS, ids=lambda check: check.__name__)
-def test_an_option_works(check, monkeypatch):
-    check(monkeypatch)
-
-
-@pytest.mark.parametrize(("check", "words"), REFUSED)
-def test_an_option_is_refused(check, words, monkeypatch):
-    with pytest.raises(InputError, match=re.escape(words)):
-        check(monkeypatch)
+@pytest.mark.parametrize("option", ["bilateral_grid", "random_bkgd"])
+def test_sparse_pixels_train_with_what_the_host_adds_to_them(option):
+    splats, cameras = make_splats(), make_cameras(CAMERAS)
+    samples = RandomPixelSampler().sample(ErrorMaps(cameras.sizes), (0, 1), 0.3, Step(0, 9, 9))
+    images = torch.rand(CAMERAS, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
+    colors, alphas, _ = sparse_rasterization(**arguments(splats, cameras), samples=samples, sh_degree=1)
+    grid = torch.ones(CAMERAS, 3, HEIGHT // 8, WIDTH // 8, requires_grad=True)  # a learnt gain for each view and place
+    if option == "bilateral_grid":
+        x, y = samples.coordinates().unbind(dim=-1)
+        colors = colors * grid[samples.view_of_slot(), :, y // 8, x // 8]  # [P, 3]
+    else:
+        colors = colors + torch.rand(1, 3) * (1.0 - alphas)
+    sparse_loss(CharbonnierNccLoss(), colors, gather_pixels(images, samples), samples).backward()
+    assert all(value.grad.any() and value.grad.isfinite().all() for value in splats.values())
+    assert option != "bilateral_grid" or grid.grad.any()

@@ -14,7 +14,7 @@ from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
 @pytest.fixture
 def process_group(request):
-    """A process group of so many processes; the others of several are torch's fake ones."""
+    """The size of a process group; processes beside this one are torch's fake ones."""
     size = request.param
     backend, store = ("gloo", distributed.HashStore()) if size == 1 else ("fake", FakeStore())
     distributed.init_process_group(backend, store=store, rank=0, world_size=size)
@@ -50,18 +50,12 @@ SWAPS = {
 }
 
 
-@pytest.mark.parametrize("process_group", [2, 8], indirect=True)
+@pytest.mark.parametrize("process_group", [2], indirect=True)
 @pytest.mark.parametrize("name", SWAPS)
 def test_several_processes_are_refused_by_name(process_group, name):
     swap, use = SWAPS[name]
     with pytest.raises(InputError, match=f"^{swap} works in one process, this process group has {process_group}: "):
         use()
-
-
-@pytest.mark.parametrize("process_group", [1], indirect=True)
-@pytest.mark.parametrize("name", SWAPS)
-def test_one_process_is_as_none(process_group, name):
-    SWAPS[name][1]()
 
 
 @pytest.mark.parametrize("process_group", [1], indirect=True)

@@ -56,7 +56,7 @@ def assert_updated(maps, before, samples, errors):
 
 
 def test_sparse_pixels(host):
-    """Those of README are a trainer's own lines (tests/test_simple_trainer.py)."""
+    """README's sparse pixels are a trainer's own lines (tests/test_simple_trainer.py)."""
     before = host["maps"].errors.clone()
     exec(block(DROP_IN, "diff", "sparse_rasterization"), host)
     host["loss"].backward()
@@ -66,7 +66,7 @@ def test_sparse_pixels(host):
 
 @pytest.mark.parametrize(("document", "language"), [(README, "diff"), (DROP_IN, "python")])
 def test_sampler_and_loss_alone(host, document, language):
-    """Of any model: here a grey image."""
+    """Sampler and loss work with any model: here a grey image."""
     grey = torch.tensor(0.5, requires_grad=True)
     before = host["maps"].errors.clone()
     host |= {"view_ids": (0, 1), "step": Step(3, 10, 10), "model": lambda samples: grey.expand(len(samples), 3)}

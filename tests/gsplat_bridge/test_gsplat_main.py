@@ -1,4 +1,4 @@
-"""The protocol of gsplat's main branch (1.6): hosts pass a `Scene`, whose rows follow those of the parameters."""
+"""The protocol of gsplat's main branch (1.6): hosts pass a `Scene`, whose rows follow the parameters' rows."""
 
 import functools
 
@@ -42,14 +42,6 @@ def test_a_scenes_rows_follow(tells_errors):
     assert len(tags) > 40 and len(tags.unique()) < 40  # some were copied, some are gone
     assert (tags.diff() < 0).any()  # and all are in another order
     assert_rows_follow(scene)
-
-
-def test_without_a_refinement_a_scene_stays_as_it_is():
-    host = Host(TurboDensityStrategy(refine_start_iter=100))
-    scene = with_scene(host)
-    before = scene.component_index
-    host.train(3)
-    assert scene.component_index is before
 
 
 def test_a_row_update_takes_a_scene_along():

@@ -17,7 +17,7 @@ from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_loss, sparse_rast
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, screen_statistics
 from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
 from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
-from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, Step
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, Step
 
 GSPLAT_KEYS = {
     *("batch_ids", "camera_ids", "gaussian_ids", "radii", "means2d", "depths", "conics", "opacities", "tile_width"),
@@ -185,23 +185,6 @@ def test_errors_in_info_become_statistics(scene, dense_images):
         torch.testing.assert_close(getattr(stats, name), getattr(by_hand, name), rtol=1e-4, atol=1e-6)
 
 
-def test_packed_info_gives_the_same_screen_statistics(scene):
-    splats, cameras, samples = scene
-    colors, _, info = sparse_rasterization(**arguments(splats, cameras), samples=samples, sh_degree=1)
-    colors.sum().backward()
-    count = len(splats["means"])
-    expected = screen_statistics(info, count)
-    visible = (info["radii"] > 0).all(dim=-1)
-    packed_means = info["means2d"].detach()[visible]
-    packed_means.grad = info["means2d"].grad[visible]
-    packed_means.absgrad = info["means2d"].absgrad[visible]
-    ids = torch.where(visible)[1]
-    packed = {**info, "means2d": packed_means, "radii": info["radii"][visible], "gaussian_ids": ids}
-    actual = screen_statistics(packed, count)
-    for name in GaussianStats.__dataclass_fields__:
-        torch.testing.assert_close(getattr(actual, name), getattr(expected, name), rtol=1e-5, atol=1e-6)
-
-
 def test_the_graph_does_not_keep_itself_alive(scene):
     splats, cameras, samples = scene
     gc.collect()
@@ -257,8 +240,6 @@ def test_half_of_what_an_update_needs_is_refused(scene):
     maps, now = ErrorMaps(cameras.sizes), Step(0, 10, 10)
     with pytest.raises(InputError, match=r"^step is a NoneType: expected Step, as maps is given"):
         sparse_loss(CharbonnierLoss(), colors, colors, samples, maps)
-    with pytest.raises(InputError, match=r"^step is a int: expected Step, as maps is given"):
-        sparse_loss(CharbonnierLoss(), colors, colors, samples, maps, 0)
     with pytest.raises(InputError, match=r"^maps is a Tensor: expected ErrorMaps, as step is given"):
         sparse_loss(CharbonnierLoss(), colors, colors, samples, maps.errors, now)
     elsewhere = ErrorMaps(cameras.sizes, "meta")
@@ -278,18 +259,20 @@ def test_gather_pixels(scene):
 
 REFUSED = [
     ({"packed": True}, r"packed=True is not supported, only False"),
+    ({"rasterize_mode": "antialiased"}, r"rasterize_mode='antialiased' is not supported"),
+    ({"sparse_grad": True}, r"sparse_grad=True is not supported"),
+    ({"with_ut": True}, r"with_ut=True is not supported"),
+    ({"camera_model": "fisheye"}, r"camera_model='fisheye' is not supported"),
     ({"render_mode": "D"}, r"render_mode='D' is not supported, only 'RGB', 'ED', 'RGB\+ED'"),
     ({"pack": False}, r"no option 'pack'"),
     ({"scales": torch.ones(3, 3)}, r"scales has shape \(3, 3\): expected \[40, 3\]"),
     ({"opacities": torch.ones(40, 1)}, r"opacities has shape \(40, 1\): expected \[40\]"),
     ({"colors": torch.ones(40, 3, 3)}, r"sh_degree 1 needs 4 bands: colors have 3"),
     ({"sh_degree": 0.5}, r"sh_degree is 0.5: expected a whole number"),
+    ({"colors": torch.rand(2, 40, 3), "sh_degree": None}, r"expected \[N, 3\] without sh_degree"),
     ({"backgrounds": torch.ones(3)}, r"backgrounds has shape \(3,\): expected \[2, 3\]"),
-    (
-        {"means": torch.ones(40, 3).double()},
-        r"quats is of torch.float32 .*: expected torch.float64 on cpu",
-    ),
-    ({"means": torch.ones(40, 3).long()}, r"means is of torch.int64: expected torch.float32 or torch.float64"),
+    ({"means": torch.ones(40, 3).double()}, r"quats is of torch.float32 .*: expected torch.float64 on cpu"),
+    ({"means": torch.ones(40, 3).half()}, r"means is of torch.float16: expected torch.float32 or torch.float64"),
     ({"quats": np.ones((40, 4))}, r"quats is a ndarray: expected a tensor"),
     ({"covars": torch.ones(40, 3, 3)}, r"covars=a tensor of shape \(40, 3, 3\) is not supported, only None"),
     ({"samples": None}, r"samples is a NoneType: expected the PixelSamples"),
@@ -297,21 +280,11 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("changed", "message"), REFUSED, ids=[next(iter(changed)) for changed, _ in REFUSED])
+@pytest.mark.parametrize(("changed", "message"), REFUSED)
 def test_what_does_not_fit_is_refused_by_name(scene, changed, message):
     splats, cameras, samples = scene
     with pytest.raises(InputError, match=message):
         sparse_rasterization(**{**arguments(splats, cameras), "samples": samples, "sh_degree": 1, **changed})
-
-
-def test_a_model_of_half_precision_is_refused(scene):
-    """Its gradients would come back not finite."""
-    splats, cameras, samples = scene
-    given = {
-        name: value.detach().half() for name, value in arguments(splats, cameras).items() if torch.is_tensor(value)
-    }
-    with pytest.raises(InputError, match=r"means is of torch.float16: expected torch.float32 or torch.float64"):
-        sparse_rasterization(**{**arguments(splats, cameras), **given}, samples=samples, sh_degree=1)
 
 
 def test_a_degree_may_be_an_integer_of_numpy(scene):
@@ -323,7 +296,7 @@ def test_a_degree_may_be_an_integer_of_numpy(scene):
 
 @pytest.mark.parametrize("name", ["viewmats", "Ks"])
 def test_cameras_that_want_a_gradient_are_refused(scene, name):
-    """As a trainer's pose optimisation does: it would train on without ever moving a camera."""
+    """A trainer's pose optimisation would train on without ever moving a camera."""
     splats, cameras, samples = scene
     given = arguments(splats, cameras)
     given[name] = given[name].clone().requires_grad_() * 1.0
@@ -333,21 +306,12 @@ def test_cameras_that_want_a_gradient_are_refused(scene, name):
         sparse_rasterization(**given, samples=samples, sh_degree=1)
 
 
-def plain_difference(colors, targets, samples):
-    return (colors - targets).abs().mean()
-
-
 NO_LOSSES = {
     "the class CharbonnierNccLoss": CharbonnierNccLoss,
-    "l1_loss": torch.nn.functional.l1_loss,
-    "L1Loss": torch.nn.L1Loss(),
-    "dist": torch.dist,
-    "plain_difference": plain_difference,
-    "NoneType": None,
+    "a function": lambda colors, targets, samples: (colors - targets).abs().mean(),
 }
 
 
-@pytest.mark.filterwarnings("ignore:size_average")
 @pytest.mark.parametrize("name", NO_LOSSES)
 def test_what_is_no_loss_on_samples_is_refused_by_name(scene, name):
     samples = scene[2]
@@ -356,45 +320,19 @@ def test_what_is_no_loss_on_samples_is_refused_by_name(scene, name):
         sparse_loss(NO_LOSSES[name], colors, torch.rand(len(samples), 3), samples)
 
 
-def test_a_loss_of_ones_own_may_be_a_function_or_a_module(scene):
-    samples = scene[2]
-    colors, targets = torch.rand(len(samples), 3, requires_grad=True), torch.rand(len(samples), 3)
-
-    expected = CharbonnierLoss()(colors.detach(), targets, samples).loss
-    for own in (OwnLoss(), OwnLoss().forward):
-        assert torch.equal(sparse_loss(own, colors, targets, samples), expected)
-
-
-def test_an_error_within_a_loss_of_ones_own_is_passed_on(scene):
-    samples = scene[2]
-    colors = torch.rand(len(samples), 3)
-
-    def own(colors, targets, samples):
-        return colors + "1"
-
-    with pytest.raises(TypeError, match="unsupported operand"):
-        sparse_loss(own, colors, colors, samples)
-
-
 def test_what_does_not_fit_the_samples_is_refused_by_name(scene):
     samples = scene[2]
     loss, count = CharbonnierNccLoss(), len(samples)
     colors = torch.rand(count, 3)
     with pytest.raises(InputError, match="samples is a NoneType: expected the PixelSamples"):
         sparse_loss(loss, colors, colors, None)
-    with pytest.raises(InputError, match="samples is a NoneType: expected the PixelSamples"):
-        gather_pixels(torch.zeros(2, HEIGHT, WIDTH, 3), None)
     with pytest.raises(InputError, match=r"images is a ndarray: expected a tensor \[C, H, W, D\]"):
         gather_pixels(np.zeros((2, HEIGHT, WIDTH, 3)), samples)
     images = torch.zeros(2, HEIGHT, WIDTH, 3)
     with pytest.raises(InputError, match=rf"targets is torch.uint8 .*: expected floating point \({count}, 3\)"):
         sparse_loss(loss, colors, colors.byte(), samples)
-    with pytest.raises(InputError, match=r"targets is torch.float32 \(2, 24, 40, 3\): expected"):
-        sparse_loss(loss, colors, images, samples)
     with pytest.raises(InputError, match=r"colors is torch.float32 \(2, 24, 40, 3\): expected"):
         sparse_loss(loss, images, colors, samples)
-    with pytest.raises(InputError, match="targets is ndarray: expected"):
-        sparse_loss(loss, colors, colors.numpy(), samples)
 
 
 def test_wrong_images_and_half_of_the_errors_are_refused(scene):

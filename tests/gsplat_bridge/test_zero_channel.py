@@ -75,7 +75,7 @@ def test_info_of_several_processes_cameras_is_refused(rendered, monkeypatch):
 
 
 def test_info_without_a_gradient_on_the_screen_is_refused(rendered):
-    """As from a render with the unscented transform, whose weights are not those of splats."""
+    """A render with the unscented transform gives such `info`; its weights are not splats'."""
     info, _ = stock_info(rendered, packed=False)
     info["means2d"] = info["means2d"].detach()
     with pytest.raises(InputError, match=r"takes no gradient, as from a render with with_ut or with_eval3d"):

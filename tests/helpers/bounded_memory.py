@@ -14,7 +14,7 @@ from turbogs_plugin.errors import InputError
 REFERENCES, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 KERNEL_COUNTS = os.access(REFERENCES, os.W_OK)
 """Linux tells the peak of a process since it was asked to forget the one before. `tracemalloc` doubles a test's time,
-and sees neither torch's memory nor that of decoders."""
+and sees no memory of torch or of decoders."""
 
 
 def outcome_within(memory: int, function: Callable, *arguments: Any) -> Any:

@@ -58,7 +58,7 @@ def _tiny_capture() -> TemporaryDirectory:
 
 
 def thin_out_points(capture: Path, every: int) -> Path:
-    """The same capture with a share of its points: 1 of `every`."""
+    """The capture with a share of its points: 1 of `every`."""
     reconstruction = load_pycolmap().Reconstruction(capture / "sparse/0")
     for point in [point for point in reconstruction.points3D if point % every]:
         reconstruction.delete_point3D(point)

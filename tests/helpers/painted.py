@@ -7,7 +7,7 @@ import numpy as np
 from turbogs_plugin.scene import PosedImages, Scene
 
 COLORS = ((255, 40, 40), (40, 255, 40), (40, 40, 255))
-"""Of the painted points; nothing else in a photo may have them."""
+"""Colours of the painted points; nothing else in a photo may have them."""
 
 
 def painted_photo(size: tuple[int, int], pixels: np.ndarray) -> np.ndarray:

@@ -16,7 +16,8 @@ SQUARES = {
     "final_keep": 1.0,
     "split": "long_axis",
 }
-"""Of `ErrorDrivenDensity`: who grows is drawn by squares, and each event first removes the 5 % of the least squares."""
+"""Settings of `ErrorDrivenDensity`: growth drawn by squares, and each event first removes the 5 % of the least
+squares."""
 
 EVENT = Step(iteration=1200, total=5000, refine_until=3500, seed=3, scene_extent=2.0)
 

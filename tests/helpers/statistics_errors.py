@@ -34,7 +34,7 @@ class StatisticsCase:
 
     Args:
         name: for tables.
-        change: makes the model of the case from that of `surface_gaussians`, in place.
+        change: makes the model of the case from `surface_gaussians`' model, in place.
         gradient: size of the colours' gradients times the number of samples.
     """
 

@@ -97,7 +97,7 @@ def gradients(terms: LossTerms, device: str, dtype: torch.dtype = torch.float32)
 
 
 def assert_structure_gradients_are_bounded(given: list[Tensor]) -> None:
-    """A tile's entries sum up to at most ncc_weight / T, as the balance says; each is at most that of the formula.
+    """A tile's entries sum up to at most ncc_weight / T, as the balance says; each is at most the formula's.
 
     The formula: |g| omega <= 1.5 sqrt(omega / f), f = c / 2, over 3 T. At c = 9e-4 and 256 samples that is 1.5 / T
     times 0.98, so the balance is the tighter one there. A difference of two gradients has the rounding of both.

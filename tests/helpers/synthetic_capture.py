@@ -22,7 +22,7 @@ POINT_NOISE = 0.01
 """Standard deviation of the points' noise."""
 PIXELS_PER_GAUSSIAN, FEWEST_GAUSSIANS = 40, 100
 EXTENT_MARGIN, TEST_EVERY = 1.1, 8
-"""As in 3DGS."""
+"""Value of 3DGS."""
 
 
 def ring_cameras(count: int, width: int, height: int, device: torch.device) -> Cameras:

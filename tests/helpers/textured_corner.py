@@ -11,7 +11,7 @@ from PIL import Image
 SIZE = (320, 240)
 FOCAL = 300.0
 EXTENT = 4.0
-"""Of each plane, from the corner."""
+"""Extent of each plane from the corner."""
 
 
 def camera_centers(count: int) -> np.ndarray:

@@ -42,7 +42,7 @@ PSNR_BOUND = 0.1
 """dB between runs on one capture in other coordinates."""
 
 STRUCTURE_BOUND = 1e-3
-"""Of a tile's gradient by l1 and NCC in float32, L2 of the difference over L2."""
+"""Tolerance of a tile's gradient by l1 and NCC in float32, L2 of the difference over L2."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,9 @@ class StatisticsTolerance:
 
 STATISTICS = StatisticsTolerance(total=1e-5, median_square=1e-4, worst_square=2e-2, exchanged=0.02)
 STIFF_STATISTICS = StatisticsTolerance(total=2e-2, median_square=1e-3, worst_square=0.5, exchanged=0.05)
-"""Of needles, and where squares leave float32's range."""
+"""Tolerance for needles, and where squares leave float32's range."""
 
 GPU_STATISTICS = StatisticsTolerance(total=2e-3, median_square=1e-3, worst_square=1.0, exchanged=0.05)
 GPU_STIFF_STATISTICS = StatisticsTolerance(total=5e-2, median_square=1e-2, worst_square=10.0, exchanged=0.1)
-"""Of the kernels, which use the hardware's exponential: twice their bound of a gradient. Stiff besides: splats whose
-alpha is on the threshold in every pixel, where single pixels fall to the other side."""
+"""Tolerance of the kernels, which use the hardware's exponential: twice their bound of a gradient. Stiff besides:
+splats whose alpha is on the threshold in every pixel, where single pixels fall to the other side."""

@@ -11,7 +11,7 @@ from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.fastgs import FastGsDensity
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
 from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
-from turbogs_plugin.strategies.density.none import NoDensity
+from turbogs_plugin.strategies.density.rows import NoDensity
 from turbogs_plugin.types import Gaussians, Step
 
 TOTAL, REFINE_UNTIL, COUNT = 60, 30, 40

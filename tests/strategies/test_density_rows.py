@@ -37,7 +37,7 @@ def test_finite_rows_have_finite_variances():
 
 
 def test_one_stays():
-    """Of the finite ones the most opaque, only where none would."""
+    """The most opaque finite Gaussian stays, only where none would."""
     gaussians = make_gaussians(4)
     gaussians.opacities[:] = torch.tensor([1.0, 3.0, 2.0, 9.0])
     gaussians.means[3] = math.nan

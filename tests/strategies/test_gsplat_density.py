@@ -132,17 +132,6 @@ def test_nothing_to_do_and_the_end():
     assert density.update(gaussians, Step(900, 1000, 800)) is None
 
 
-def test_one_is_left_when_gsplat_would_leave_none():
-    gaussians = make_gaussians(6, dtype=torch.float32)
-    gaussians.opacities[:] = torch.tensor([-9.0, -8.0, -7.0, -6.0, -10.0, -11.0])
-    density = GsplatDefaultDensity()
-    density.setup(gaussians)
-    update = density.update(gaussians, Step(600, 1000, 800))
-    assert update.source.tolist() == [3] and update.num_pruned == 5
-    density.apply(update)
-    assert len(density.stats.view_counts) == 1
-
-
 @pytest.mark.parametrize("values", [{"opacity_reset": "never"}, {"refine_every": 0}, {"refine_start_iter": -1}])
 def test_refuses(values):
     with pytest.raises(InputError, match=next(iter(values))):

@@ -30,7 +30,7 @@ STRUCTURED = [loss for loss in EVERY if isinstance(loss, CharbonnierNccLoss)]
 
 
 def make_samples(counts, empty=(), weights=None):
-    """Tiles of a 16-pixel-high strip with so many slots each; the last `empty[tile]` of a tile are empty."""
+    """Tiles of a 16-pixel-high strip with `counts` slots; the last `empty[tile]` of a tile are empty."""
     counts = np.asarray(counts)
     places = pixel_table(np.array([[16 * len(counts), 16]]), "cpu").numpy()
     ids = np.concatenate([places[tile, :count] for tile, count in enumerate(counts)])
@@ -214,7 +214,7 @@ def test_empty_slots_have_no_part(loss):
 
 @pytest.mark.parametrize("loss", EVERY, ids=repr)
 def test_no_tile_is_no_loss(loss):
-    """As where masks hide all of a batch."""
+    """Masks that hide all of a batch leave no tile."""
     samples = make_samples([4])
     nothing = torch.zeros(0, dtype=torch.int32)
     samples = PixelSamples(samples.view_ids, samples.sizes, nothing, nothing, torch.zeros(1, dtype=torch.int32))
@@ -246,21 +246,6 @@ def test_a_step_against_the_gradient_raises_the_correlation(structure):
 
     assert (correlations(colors - structure_part) > correlations(colors) + 1e-4).all()
     assert (correlations(colors + structure_part) < correlations(colors) - 1e-4).all()
-
-
-def test_textured_tiles_have_the_papers_ncc():
-    """Far above the floor, 1 - S is one minus numpy's correlation coefficient, and ignores gain and offset."""
-    generator = torch.Generator().manual_seed(5)
-    targets = torch.rand(64, 3, generator=generator, dtype=torch.float64)
-    noise = torch.rand(64, 3, generator=generator, dtype=torch.float64)
-    samples = make_samples([64])
-    loss = CharbonnierNccLoss(ncc_weight=1.0, variance_constant=1e-9)
-    plain = CharbonnierLoss()
-    for colors in (targets * 0.5 + 0.5 * noise, 3.0 * targets + 0.7 * noise - 0.4):
-        structure = loss(colors, targets, samples).loss - plain(colors, targets, samples).loss
-        factor = expected_balance(loss, colors.numpy(), targets.numpy(), samples)[0]
-        expected = np.mean([1 - np.corrcoef(colors[:, c], targets[:, c])[0, 1] for c in range(3)])
-        assert structure.item() == pytest.approx(factor * expected, rel=1e-5)
 
 
 def test_printed_ncc_is_the_appendix():
@@ -347,16 +332,6 @@ def test_gradients_stay_below_the_stated_bound(loss):
         assert (result.color_gradients.abs() <= gradient_bound(loss, samples) * 1.001).all(), case
 
 
-@pytest.mark.parametrize("name", list(extreme_tiles()))
-@pytest.mark.parametrize("ssim_weight", [0.2, 1.0])
-def test_ssim_stays_finite(name, ssim_weight):
-    colors, targets = extreme_tiles()[name]
-    result = SparseSsimLoss(ssim_weight=ssim_weight)(colors, targets, make_samples([30]))
-    assert torch.isfinite(result.loss)
-    assert torch.isfinite(result.color_gradients).all()
-    assert result.color_gradients.abs().max() < 30
-
-
 @pytest.mark.parametrize("loss", STRUCTURED, ids=repr)
 @pytest.mark.parametrize("level", [0.0, 0.1, 0.7, 1.0, 1e4])
 def test_one_sample_and_constant_tiles_get_the_l1_gradient_alone(loss, level):
@@ -401,15 +376,6 @@ def test_a_colour_that_is_not_finite_spoils_nothing(loss, bad):
     assert torch.isfinite(result.color_gradients).all()
     assert (result.color_gradients[0] == 0).all()
     assert result.pixel_errors[0] == 0
-
-
-@pytest.mark.parametrize("loss", EVERY, ids=repr)
-def test_loss_does_not_depend_on_the_order_of_tiles(loss):
-    colors, targets, samples = random_case(counts=(6, 6, 6), empty=())
-    order = torch.arange(18).view(3, 6).flip(0).reshape(-1)
-    result, flipped = loss(colors, targets, samples), loss(colors[order], targets[order], samples)
-    assert result.loss.item() == pytest.approx(flipped.loss.item(), rel=1e-12)
-    assert torch.allclose(result.color_gradients[order], flipped.color_gradients, rtol=1e-10, atol=1e-14)
 
 
 def test_without_a_single_filled_slot_the_loss_is_zero():

@@ -11,7 +11,6 @@ from helpers.optimizers import STEP, all_finite, clone, equal, make_gaussians, m
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
@@ -144,17 +143,6 @@ def test_scale_of_the_loss_does_not_matter(factor, dtype, tolerance):
         assert (first - second).norm() <= tolerance * first.norm(), name
 
 
-def test_scale_of_the_loss_does_matter_in_the_papers_units():
-    paths = []
-    for scale in (1.0, 1e3):
-        gaussians = make_gaussians(5)
-        optimizer = MomentLMOptimizer(units="paper")
-        optimizer.setup(gaussians)
-        optimizer.step(gaussians, scaled(make_gradients(3, 5, size=1e-2), scale), STEP)
-        paths.append(gaussians.means)
-    assert not torch.allclose(*paths, rtol=1e-2)
-
-
 @given(
     st.lists(st.floats(-30, 30), min_size=14, max_size=14),
     st.integers(1, 4),
@@ -233,12 +221,3 @@ def test_a_useless_share_of_the_loss(share):
     optimizer.step(gaussians, gradients, STEP)
     assert all_finite(gaussians)
     assert int(optimizer.skipped) == 0
-
-
-@pytest.mark.parametrize(
-    "values",
-    [{"units": "metres"}, {"rows": "pixels"}, {"curvature": -1.0}, {"max_step": math.inf}],
-)
-def test_refuses(values):
-    with pytest.raises(InputError, match=next(iter(values))):
-        MomentLMOptimizer(**values)

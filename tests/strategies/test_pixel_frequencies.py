@@ -178,7 +178,7 @@ def test_weights_have_mean_one_and_same_draw(unit, importance):
 
 def test_what_was_likely_to_be_drawn_weighs_little_and_the_exponent_says_how_little():
     """Two errors a thousandfold apart, drawn by error alone: the weights of the small one are the large ones, and those
-    of exponent 1 are the fourth power of those of 1/4, up to the factor that makes their mean 1."""
+    of exponent 1 are the fourth power of the weights of 1/4, up to the factor that makes their mean 1."""
     generator = torch.Generator().manual_seed(5)
     large = torch.rand(32, 32, generator=generator) < 0.5
     errors = torch.where(large, 1.0, 1e-3)

@@ -23,11 +23,31 @@ from turbogs_plugin.gsplat_bridge.host import (
     require_one_process,
 )
 from turbogs_plugin.gsplat_bridge.optimizer_swap import COUNT, MemberOptimizer
-from turbogs_plugin.gsplat_bridge.tuned import TUNED_DENSITY
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.strategies.density.error_driven import FINAL_PRUNINGS, ErrorDrivenDensity
 from turbogs_plugin.strategies.density.rows import add_stats
 from turbogs_plugin.types import GaussianStats, RowUpdate, Step
+from turbogs_plugin.yaml_json import read_named_yaml
+
+TUNED: dict[str, dict[str, Any]] = {
+    section: {name: value for name, value in settings.items() if name != "type"}
+    for section, settings in read_named_yaml("turbogs", "turbogs_plugin.configs", "config").items()
+}
+"""Section -> settings of `configs/turbogs.yaml`, the defaults of what is swapped into a trainer."""
+
+GATES = {
+    "choose_by": "difficulty",
+    "prune_score_fraction": 0.0,
+    "top_fraction": 0.9,
+    "grad_threshold": 2e-4,
+    "absgrad_threshold": 2e-4,
+    "final_keep": 1.0,
+}
+"""Settings in place of turbogs' draw by squares, which gsplat's rasterization does not give, and of final pruning. The
+numbers of docs/drop-in.md were measured with them."""
+
+TUNED_DENSITY = ErrorDrivenDensity(**TUNED["density"] | GATES)
+"""Density control with the settings of `configs/turbogs.yaml`, but for `GATES`."""
 
 _STATS = tuple(field.name for field in fields(GaussianStats))
 _DRIVEN_BY = "driven_by"
@@ -44,20 +64,20 @@ _ANNOUNCEMENTS = {
 class TurboDensityStrategy(DefaultStrategy):
     """`ErrorDrivenDensity` behind the protocol of gsplat's strategies.
 
-    A subclass of `DefaultStrategy`, since trainers branch on that. Its fields keep their meaning there:
+    A subclass of `DefaultStrategy`, since trainers branch on that. Fields of `DefaultStrategy` keep their meaning:
     refine_start_iter, refine_stop_iter, refine_every, prune_opa, grow_grad2d, grow_scale3d, prune_scale3d, and
     prune_scale2d where refine_scale2d_stop_iter is above 0; any of them may change at any time. Opacities are never
-    reset; reset_every only says when pruning by size begins. grow_scale2d has no effect. The fields below are those of
-    `ErrorDrivenDensity` of the same name.
+    reset; reset_every only says when pruning by size begins. grow_scale2d has no effect. The fields below are named and
+    meant as in `ErrorDrivenDensity`.
 
     The defaults are the values of `configs/turbogs.yaml`, read from there, also for grow_scale3d. But who grows is
-    gated by gradients (`tuned.GATES`), where turbogs draws by squares. When and how often is refined stays gsplat's, as
+    gated by gradients (`GATES`), where turbogs draws by squares. When and how often is refined stays gsplat's, as
     trainers scale those fields. `prune_world_reference` and `spare_beyond` are left out: they hold where the origin is
     the cameras' centre and a backdrop stands behind the scene.
 
     Once a line ``info.update(prediction=colors, ground_truth=pixels)`` stands before ``loss.backward()``, Gaussians are
-    ranked by the error they carry (see `gaussian_errors`); without it, by their screen gradients. Which of the two
-    it is, is printed at the first step, and must stay so.
+    ranked by the error they carry (see `gaussian_errors`); without it, by their screen gradients. The first step prints
+    which of the two ranks them, and later steps must agree.
 
     Args:
         absgrad: also densify by absolute gradients above grow_absgrad2d; render with ``absgrad=True`` then.
@@ -67,7 +87,7 @@ class TurboDensityStrategy(DefaultStrategy):
             grow_absgrad2d and prune_score_fraction to turbogs' values with it.
         max_gaussians: never more, at any step, as the end of the run is not known.
         final_every, final_keep: final pruning after refine_stop_iter, three times at most; off where final_keep is 1.
-        seed: of the positions of split Gaussians.
+        seed: decides the positions of split Gaussians.
     """
 
     grow_grad2d: float = TUNED_DENSITY.grad_threshold
@@ -126,8 +146,8 @@ class TurboDensityStrategy(DefaultStrategy):
         """To be called after the optimizers' steps. Changes `params`, `optimizers` and `state` in place.
 
         Args:
-            packed, host_options: what hosts hand to their own strategies; not used. Whether `info` is packed, it says
-                itself.
+            packed, host_options: what hosts hand to their own strategies; not used. `info` says itself whether it is
+                packed.
             scene: of gsplat from 1.6 on, a container with more arrays over Gaussians, whose rows follow.
 
         Raises:
@@ -200,7 +220,7 @@ class TurboDensityStrategy(DefaultStrategy):
         return window
 
     def _due(self, step: int) -> bool:
-        """Whether a densification or a final pruning happens at this step, at gsplat's places in the schedule."""
+        """True at a step with a densification or a final pruning, at gsplat's places in the schedule."""
         if step < self.refine_stop_iter:
             return step > self.refine_start_iter and step % self.refine_every == 0
         return (step - self.refine_stop_iter + 1) % self.final_every == 0
@@ -239,8 +259,8 @@ def apply_row_update(
     Args:
         update: new rows; parameters that it does not know are copied row by row.
         params, optimizers, state: as in gsplat's operations; changed in place.
-        scene: a `gsplat.scene.Scene`, as gsplat's operations take it from 1.6 on, or None. Its hooks are called, by
-            which `GaussianScene` keeps `component_index` and `signal`: row i becomes a copy of old row `source[i]`.
+        scene: a `gsplat.scene.Scene`, as gsplat's operations take it from 1.6 on, or None. Its hooks are called,
+            by which `GaussianScene` keeps `component_index` and `signal`: row i becomes a copy of old row `source[i]`.
     """
     count = len(params["means"])
     for name, parameter in [*params.items()]:

@@ -1,5 +1,4 @@
-"""What a gsplat trainer keeps and hands over (its parameters and `info`), checked, with errors that name what was
-expected."""
+"""Checks of a gsplat trainer's parameters and `info`, with errors that name what was expected."""
 
 from __future__ import annotations
 
@@ -14,16 +13,16 @@ from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
 
 Parameters = dict[str, torch.nn.Parameter] | torch.nn.ParameterDict
 Optimizers = Mapping[str, torch.optim.Optimizer]
-"""A host's, by the names of the parameters."""
+"""The optimizers of a host by the names of the parameters."""
 
 PREDICTION, GROUND_TRUTH = "prediction", "ground_truth"
-"""Keys under which a host puts what it rendered and what it should have been into `info`."""
+"""Keys of `info` under which a host puts its render and the ground truth."""
 
 STATISTICS = "gaussian_stats"
 """Key under which `sparse_rasterization` leaves the pass's `GaussianStats` once backward has run."""
 
 LOSS_SHARES = "loss_shares"
-"""Key under which it leaves, beside them, [N] the Gaussians' shares of the loss."""
+"""Key under which `sparse_rasterization` leaves [N] the Gaussians' shares of the loss once backward has run."""
 
 LAYOUTS: dict[str, list[tuple[str | int, ...]]] = {
     "means": [("N", 3)],
@@ -33,8 +32,8 @@ LAYOUTS: dict[str, list[tuple[str | int, ...]]] = {
     "sh0": [("N", 1, 3), ("N", 3)],
     "shN": [("N", "B", 3)],
 }
-"""gsplat's shape of each parameter: N Gaussians, B harmonics above band 0. Behind it the shape that is taken beside it,
-as nerfstudio's splatfacto has it."""
+"""Shapes of each parameter, N Gaussians with B harmonics above band 0: gsplat's, then nerfstudio's splatfacto's, which
+is taken too."""
 
 GEOMETRY = ("means", "quats", "scales", "opacities")
 

@@ -1,14 +1,15 @@
 """`SparseAdam` and `MomentLMOptimizer` behind gsplat's dict of optimizers, one for each parameter.
 
 A Gaussian's parameters are solved for together, but a gsplat trainer steps one optimizer after another and clears each
-gradient in between. So each member of the dict is a `torch.optim.Optimizer` that *hands over* its gradient when it is
-stepped, and whichever member comes last, in any order, carries out the update of all. Until then no parameter moves.
+gradient in between. Each member of the dict is therefore a `torch.optim.Optimizer` that *hands over* its gradient when
+it is stepped, and whichever member comes last, in any order, carries out the update of all. Until then no parameter
+moves.
 
-What each member keeps for its parameter is in its own ``state``, as gsplat's operations on rows expect: the moments are
+A member's ``state`` holds what is kept for its parameter, as gsplat's operations on rows expect: the moments are
 tensors with one row a Gaussian; "step", which they leave as it is, is one number. The bias correction counts steps of
 the host, as torch's Adam does, not updates of each Gaussian: a new Gaussian, whose moments are zero, then moves faster
-than its rate (`DenseAdam` says by how much), which hosts of few steps live on. Learning rate, betas and eps are those
-of the member's own parameter group.
+than its rate (`DenseAdam` says by how much), which hosts of few steps live on. Learning rate, betas and eps come from
+the member's own parameter group.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ operations take every other value for one with rows."""
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
 OPTIONS_NOT_TAKEN = ("weight_decay", "maximize", "amsgrad")
-"""Of torch's Adam: they change its steps, and the shared update has no such thing."""
+"""Options of torch's Adam that change its steps, and that the shared update does not know."""
 
 DTYPES = (torch.float32, torch.float64)
-"""Of parameters: in half precision small steps are lost by rounding, and float16 has no eps of 1e-15."""
+"""Types of parameters: in half precision small steps are lost by rounding, and float16 has no eps of 1e-15."""
 
 MOST_SKIPPED = 100
 """Iterations in a row that may be skipped. A `GradScaler` halves its scale at each, so it needs a few dozen at most."""
@@ -69,8 +70,8 @@ class SharedOptimizer:
 
     Args:
         optimizer: a `SparseAdam`, as a `MomentLMOptimizer` is, too. Its learning rates, betas and eps are replaced by
-            those of the members' parameter groups. Autograd gives the sum of the gradients over views, so J has one
-            row, whatever `MomentLMOptimizer.rows` says.
+            the values of the members' parameter groups. Autograd gives the sum of the gradients over views, so J has
+            one row, whatever `MomentLMOptimizer.rows` says.
     """
 
     def __init__(self, optimizer: SparseAdam) -> None:
@@ -98,7 +99,7 @@ class SharedOptimizer:
 
         Args:
             params: one group with "params", "name" (of the parameter) and "lr", as gsplat's trainers make them.
-            lr, betas, eps: where the group has none; those of the optimizer where None.
+            lr, betas, eps: values for a group that has none; the optimizer's where None.
             fused: taken for the sake of hosts that pass it; the update is one for all parameters in any case.
         """
         require_one_process("SharedOptimizer")
@@ -133,7 +134,7 @@ class SharedOptimizer:
     def drop_stale(self) -> None:
         """Forget the gradients of an iteration in which not all members were stepped, as soon as the next one begins.
 
-        A `GradScaler` leaves out each optimizer whose gradient has an inf. Its iteration is then skipped whole, for all
+        A `GradScaler` leaves out each optimizer whose gradient has an inf. The iteration is then skipped whole, for all
         parameters, so no update mixes two iterations. The first such iteration is printed.
 
         Raises:
@@ -266,14 +267,15 @@ class MemberOptimizer(torch.optim.Optimizer):
             )
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies and pickles, which are of all members, as each one knows the others; torch's lacks our part."""
+        """State for copies and pickles, with the part that torch's lacks. Members are copied together, as each
+        knows the others."""
         return {**super().__getstate__(), "shared": self.shared, "name": self.name}
 
     def add_param_group(self, param_group: dict[str, Any]) -> None:
-        """Torch calls this for the one group that a member is made with.
+        """Add the one group that a member is made with; torch calls this.
 
         Raises:
-            InputError: there is that group already.
+            InputError: the member has its group already.
         """
         if self.param_groups:
             raise InputError(
@@ -321,7 +323,7 @@ class MemberOptimizer(torch.optim.Optimizer):
         """The state of the parameter, zeros at first.
 
         Raises:
-            InputError: its rows are not those of the parameter.
+            InputError: the state has another number of rows than the parameter.
         """
         parameter, state = self.parameter, self.state[self.parameter]
         if not state:

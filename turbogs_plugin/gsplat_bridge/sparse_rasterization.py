@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import weakref
 from collections.abc import Callable
 from numbers import Integral
@@ -35,10 +34,10 @@ LOGIT_MARGIN = 2.0**-23
 """Opacities are kept this far from 0 and 1, where the logit is infinite. An alpha is cut at 0.999 in any case."""
 
 ONE_RADIUS = Version(gsplat.__version__) < Version("1.5")
-"""Whether the installed gsplat's strategies expect one radius of each Gaussian, not one of each axis."""
+"""True where the installed gsplat's strategies expect one radius of each Gaussian, not one of each axis."""
 
 RENDER_MODES = ("RGB", "ED", "RGB+ED")
-"""Those of gsplat's that there are here: colours, expected depth, or both."""
+"""Render modes of gsplat that are supported here: colours, expected depth, or both."""
 
 _ONLY = {"radius_clip": 0.0, "tile_size": TILE_SIZE, "rasterize_mode": "classic", "camera_model": "pinhole"}
 _ONLY |= dict.fromkeys(("packed", "sparse_grad", "distributed", "segmented", "with_ut", "with_eval3d"), False)
@@ -78,8 +77,8 @@ def sparse_rasterization(
         sh_degree: highest degree used.
         backgrounds: [C, 3], or None for black.
         absgrad: taken for gsplat's sake; ``info["means2d"].absgrad`` is there after backward either way.
-        render_mode: "RGB", "ED" or "RGB+ED", as in gsplat. ED is the expected depth, the sum of w * z over that of w,
-            with z along the camera's axis as Ks has it (no distance), in the unit of `means`; 0 where nothing was hit.
+        render_mode: "RGB", "ED" or "RGB+ED", as in gsplat. ED is the expected depth, sum of w * z over sum of w, with
+            z along the camera's axis as Ks has it (no distance), in the unit of `means`; 0 where nothing was hit.
         gsplat_options: further options of gsplat's function, where they have the value that is supported.
 
     Returns:
@@ -123,7 +122,7 @@ def sparse_rasterization(
         Gaussians(means, quats, scales, opacities, sh0=colors[:, :1], shN=colors[:, 1:]),
         Cameras(viewmats, Ks, samples.sizes),
         samples,
-        sh_degree=int(sh_degree),  # it may be numpy's
+        sh_degree=int(sh_degree),  # numpy's integers are taken too
         settings=RasterSettings(eps2d=eps2d, near_plane=near_plane, far_plane=far_plane),
         with_depth=render_mode != "RGB",
         observer=observer,
@@ -195,7 +194,7 @@ def sparse_loss(
 
 
 def _map_update(maps: ErrorMaps | None, step: Step | None, device: torch.device) -> MapUpdate | None:
-    """What is to be done with the errors; None if nothing."""
+    """The update of `maps` by the samples' errors; None where neither is given."""
     if maps is None and step is None:
         return None
     if isinstance(maps, ErrorMaps) and isinstance(step, Step):
@@ -230,31 +229,16 @@ def _call(loss: Any, colors: Tensor, targets: Tensor, samples: PixelSamples) -> 
     """The output of a loss on samples.
 
     Raises:
-        InputError: it is none.
+        InputError: `loss` is a class, or gives anything but a `LossOutput`.
     """
-    output = None
-    try:
-        output = None if isinstance(loss, type) else loss(colors, targets, samples)
-    except TypeError:  # of its own, or as it takes other arguments
-        if _takes_three(loss):
-            raise
+    output = None if isinstance(loss, type) else loss(colors, targets, samples)
     if not isinstance(output, LossOutput):
-        name = getattr(loss, "__name__", type(loss).__name__)
-        found = f"the class {name}" if isinstance(loss, type) else name
+        found = f"the class {loss.__name__}" if isinstance(loss, type) else f"a {type(loss).__name__}"
         raise InputError(
             f"loss is {found}: expected an instance of a loss on samples, as CharbonnierNccLoss() is, which is called "
             "with (colors, targets, samples) and gives a LossOutput"
         )
     return output
-
-
-def _takes_three(loss: Any) -> bool:
-    """Whether it can be called with colours, targets and samples."""
-    try:
-        inspect.signature(loss.forward if isinstance(loss, torch.nn.Module) else loss).bind(None, None, None)
-    except (TypeError, ValueError):  # not callable, of other arguments, or one that does not tell
-        return False
-    return True
 
 
 class _Loss(torch.autograd.Function):
@@ -334,7 +318,7 @@ def _check_tensors(given: dict[str, Any]) -> None:
     for name, value in given.items():
         if not isinstance(value, Tensor):
             raise InputError(f"{name} is a {type(value).__name__}: expected a tensor")
-        if value.dtype not in (torch.float32, torch.float64):  # of fewer bits, gradients come back not finite
+        if value.dtype not in (torch.float32, torch.float64):  # gradients of fewer bits come back not finite
             raise InputError(f"{name} is of {value.dtype}: expected torch.float32 or torch.float64")
         if (value.dtype, value.device) != (means.dtype, means.device):
             raise InputError(

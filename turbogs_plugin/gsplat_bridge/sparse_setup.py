@@ -1,4 +1,4 @@
-"""What the sparse swap needs once, before the loop: how many views and pixels a step, and the error maps."""
+"""Set-up of the sparse swap before the loop: views and pixels a step, and the error maps."""
 
 from __future__ import annotations
 
@@ -10,8 +10,12 @@ import torch
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, require
-from turbogs_plugin.gsplat_bridge.tuned import TUNED_SCHEDULE
+from turbogs_plugin.gsplat_bridge.density_swap import TUNED
+from turbogs_plugin.strategies.schedule import SinusoidalSchedule
 from turbogs_plugin.types import SamplingBudget
+
+TUNED_SCHEDULE = SinusoidalSchedule(**TUNED["schedule"])
+"""The schedule of views and rate with the settings of `configs/turbogs.yaml`."""
 
 DEFAULT_VIEWS = 4
 """Views a step where a trainer leaves it open. Between the 3 and 10 of turbogs' schedule; a quarter of one view's
@@ -22,8 +26,8 @@ def sparse_budget(num_views: int, batch_size: int | None = None) -> SamplingBudg
     """Views and rate of every step of a gsplat trainer with sparse pixels; prints in one line what it chose.
 
     The rule: a step sees as many pixels as one whole image has, which is what a stock trainer sees at batch 1, spread
-    over its K views: ``rate = pixel_budget / K``, with the pixel_budget of `configs/turbogs.yaml`, which is 1. So at
-    batch 1 every pixel is drawn, and nothing is lost against stock. The rate is never less than the least of turbogs'
+    over its K views: ``rate = pixel_budget / K``, with the pixel_budget of `configs/turbogs.yaml`, which is 1. At batch
+    1 every pixel is drawn, and nothing is lost against stock. The rate is never less than the least of turbogs'
     schedule, ``pixel_budget / max_views``; batches larger than that see more than one image.
 
     Args:

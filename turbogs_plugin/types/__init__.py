@@ -7,7 +7,7 @@ Every shape is written with these letters:
 - ``P`` sample slots, ordered by (view of the batch, tile), ``T`` tiles that hold samples;
 - ``X`` pixels of all training views laid end to end ("flat pixels").
 
-This package imports nothing of the project but its exception, so strategies and framework can both import it.
+`turbogs_plugin.types` imports nothing of the project but its exception, so strategies and framework can both import it.
 """
 
 from turbogs_plugin.types.cameras import BLACK, WHITE, Cameras, Color

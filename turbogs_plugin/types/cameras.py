@@ -1,4 +1,4 @@
-"""Where photos were taken from, and colours."""
+"""Cameras of photos, and colours."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class Cameras:
         sizes: [C, 2] int64 numpy array (width, height), on the host so that shapes cost no synchronisation.
 
     Attributes:
-        viewmats, Ks, sizes: these, also of cameras from `select`.
+        viewmats, Ks, sizes: as given, or the selected rows of them after `select`.
     """
 
     def __init__(self, viewmats: Tensor, Ks: Tensor, sizes: np.ndarray) -> None:
         self.sizes = sizes
-        # Of selected cameras: their rows in the two tensors, which then belong to all that they were selected from.
+        # Rows of selected cameras in the two tensors, which then belong to the cameras that they were selected from.
         self._rows: tuple[int, ...] | None = None
         self._viewmats, self._Ks = viewmats, Ks
 
@@ -60,10 +60,10 @@ class Cameras:
         self._Ks = Ks
 
     def select(self, view_ids: Sequence[int]) -> Cameras:
-        """The cameras of these views, in this order; `range` for a run of them. This launches nothing on a device.
+        """The cameras of these views, in this order; `range` for a run of them. Nothing is launched on a device.
 
-        They share memory with these ones until their `viewmats` or `Ks` are read, which makes a copy. Where gradients
-        flow to these ones, it is made at once.
+        The selected cameras share memory with the present ones until their `viewmats` or `Ks` are read, which makes a
+        copy. Where gradients flow to the present cameras, the copy is made at once.
 
         Raises:
             IndexError: a view that is not there.

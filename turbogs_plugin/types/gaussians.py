@@ -1,4 +1,4 @@
-"""The model, and what is known of each of its Gaussians: gradients, statistics, and a change of their set."""
+"""The model, the gradients and statistics of its Gaussians, and a change of their set."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class GaussianStats:
         weight_sums: [N] float32, sum of w.
         grad_sums: [N] float32, sum over views of the norm of the screen gradient of the mean, in gsplat's units
             (x scaled by K * width / 2, y by K * height / 2).
-        absgrad_sums: [N] float32, the same for the absolute gradients (AbsGS).
+        absgrad_sums: [N] float32, the sum like `grad_sums` for the absolute gradients (AbsGS).
         square_sums: [N] float32, sum over views and samples of (o * d loss / d o)^2, o the opacity.
         view_counts: [N] float32, views in which the Gaussian was on screen.
         max_radii: [N] float32, largest screen radius over the larger side of the image.
@@ -163,7 +163,7 @@ class RowUpdate:
         return Gaussians(**{name: self.new(name, gaussians) for name, _ in gaussians.items()})
 
     def taking(self, rows: Tensor) -> RowUpdate:
-        """The same change with these of its new rows alone, in this order."""
+        """The change with these of its new rows alone, in this order."""
         values = {name: value[rows] for name, value in self.values.items()}
         return replace(self, source=self.source[rows], fresh=self.fresh[rows], values=values)
 

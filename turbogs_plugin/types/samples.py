@@ -34,7 +34,7 @@ def sample_order(x: Tensor, y: Tensor) -> Tensor:
 
 @lru_cache(maxsize=4096)
 def _starts(sizes: bytes, origin: tuple[int, int]) -> tuple[int, ...]:
-    """`TileGrid.starts` of these int64 sizes. Kept, as iterations ask for few sizes again and again."""
+    """`TileGrid.starts` of these int64 sizes. The result is kept, as iterations ask for few sizes again and again."""
     grid = TileGrid(np.frombuffer(sizes, dtype=np.int64).reshape(-1, 2), origin)
     return 0, *grid.shapes.prod(axis=1).cumsum().tolist()
 
@@ -58,7 +58,7 @@ class TileGrid:
 
     @property
     def starts(self) -> tuple[int, ...]:
-        """K + 1 numbers: of the first tile of each image; the last one is the count of all tiles."""
+        """K + 1 numbers: the first tile of each image, and at the end the count of all tiles."""
         return _starts(np.asarray(self.sizes, dtype=np.int64).tobytes(), tuple(self.origin))
 
     @property
@@ -133,8 +133,8 @@ class PixelSamples:
         sizes: np.ndarray | Sequence[tuple[int, int]],
         view_ids: Sequence[int] | None = None,
     ) -> PixelSamples:
-        """Given pixels, in the order of samples, which is not that in which they are given: `coordinates` and
-        `view_of_slot` tell it. On a GPU the host waits for the checks.
+        """Given pixels in the order of samples, which differs from the given order: `coordinates` and `view_of_slot`
+        tell where each pixel went. On a GPU the host waits for the checks.
 
         Args:
             views: [P] integers, position in the batch (0 .. K - 1) of each pixel's view.
@@ -205,7 +205,7 @@ class PixelSamples:
         Args:
             tiles: positions in `tile_ids`.
             views: positions in the batch of their views.
-            slots: of these tiles.
+            slots: the slots of these tiles.
         """
         tile_offsets = self.tile_offsets[tiles.start : tiles.stop + 1]
         starts = self.grid.starts

@@ -1,4 +1,4 @@
-"""Where training stands."""
+"""The present iteration of a run, and how much it samples."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Step:
-    """Where training stands. Algorithm 1's rho is `progress`; the scheduling appendix's rho is `anneal`.
+    """The present iteration of a run. Algorithm 1's rho is `progress`; the scheduling appendix's rho is `anneal`.
 
     Args:
         iteration: t, from 0.
@@ -36,7 +36,7 @@ class Step:
 
 @dataclass(frozen=True)
 class SamplingBudget:
-    """How much one iteration samples: `views` (K) views, and the fraction `rate` (r) of each tile's pixels."""
+    """Samples of one iteration: `views` (K) views, and the fraction `rate` (r) of each tile's pixels."""
 
     views: int
     rate: float
