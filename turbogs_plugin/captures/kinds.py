@@ -94,8 +94,8 @@ def capture_near(path: Path) -> str:
     if inner:
         captures = named([f"{folder} has a {_mark(folder)}" for folder in inner])
         return f"{captures}: give {'that folder' if len(inner) == 1 else 'one of these folders'}"
-    parents = path.parents if path.parent.parts else path.resolve().parents
-    around = next((folder for folder in parents[: LEVELS + path.is_file()] if _mark(folder)), None)
+    parents = path.absolute().parents[: LEVELS + path.is_file()]
+    around = next((folder for folder in parents if _mark(folder)), None)
     return f"{path} lies in the capture {around} ({_mark(around)}): give that folder" if around else ""
 
 
