@@ -98,40 +98,6 @@ def test_mip_nerf_360(tmp_path, kept):
         assert load_scene(tmp_path / "garden", 8).train.cameras.sizes[0].tolist() == [30, 20]
 
 
-def llff_table(camera: pycolmap.Camera) -> np.ndarray:
-    rows = []
-    for view in range(VIEWS):
-        pose = pose_of(view)
-        right, down, forward = pose[:, :3]
-        hwf = [camera.height, camera.width, camera.params[0]]
-        matrix = np.stack([down, right, -forward, -pose[:, :3].T @ pose[:, 3], hwf], axis=1)
-        rows.append([*matrix.ravel(), 2.0, 9.0])
-    return np.array(rows)
-
-
-@pytest.mark.parametrize("full", [True, False])
-def test_llff(tmp_path, full):
-    """images/IMG_*.JPG of COLMAP's sparse/0, and copies under other names; the former are often not kept."""
-    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=240, height=160, params=[200.0, 120.0, 80.0, 0.0])
-    names = [f"IMG_{4026 + view}.png" for view in range(VIEWS)]
-    write_model(tmp_path / "fern/sparse/0", [camera], names)
-    copies = [f"image{view:03d}.png" for view in range(VIEWS)]
-    write_photos(tmp_path / "fern/images_4", [camera], copies, 4)
-    write_photos(tmp_path / "fern/images_8", [camera], copies, 8)
-    if full:
-        write_photos(tmp_path / "fern/images", [camera], names)
-    np.save(tmp_path / "fern/poses_bounds.npy", llff_table(camera))
-    for name in ("simplices.npy", "trimesh.png", "database.db", "view_imgs.txt"):
-        (tmp_path / "fern" / name).write_bytes(b"not for us")
-    scene = load_scene(tmp_path / "fern", 1 if full else 4)
-    require_painted(scene)
-    if full:
-        assert "COLMAP" in scene.notes[0] and scene.notes[-1] == "poses_bounds.npy not used"
-    else:
-        assert "photos of images_4" in scene.notes[0] and scene.train.cameras.sizes[0].tolist() == [60, 40]
-        assert f"not used: {tmp_path / 'fern/sparse/0'} names 9 photos, of which 9 are missing" in scene.notes[1]
-
-
 def write_nerfstudio(folder: Path, cameras: list[pycolmap.Camera], names: list[str], **content) -> None:
     """transforms.json of `ns-process-data`, each frame with intrinsics of its own, and sparse_pc.ply."""
     frames = []
@@ -180,27 +146,22 @@ def test_instant_ngp(tmp_path, model, suffix):
     assert scene.notes[1:] == ("transforms.json not used",)
 
 
-@pytest.mark.parametrize("kind", ["llff", "transforms"])
 @pytest.mark.parametrize("trouble", ["photos", "damaged", "incomplete"])
-def test_a_model_that_cannot_be_read_gives_way_to_other_poses_and_is_said(tmp_path, kind, trouble):
+def test_a_model_that_cannot_be_read_gives_way_to_other_poses_and_is_said(tmp_path, trouble):
     folder, camera = tmp_path / "fern", [pinhole(240, 160, 200.0)]
     write_photos(folder / "images", camera, NAMES)
-    if kind == "llff":
-        np.save(folder / "poses_bounds.npy", llff_table(camera[0]))
-    else:
-        write_nerfstudio(folder, camera, [f"images/{name}" for name in NAMES])
-    before, model = load_scene(folder).notes, folder / "sparse/0"
+    write_nerfstudio(folder, camera, [f"images/{name}" for name in NAMES])
+    model = folder / "sparse/0"
     write_model(model, camera, [f"raw-{name}" for name in NAMES] if trouble == "photos" else NAMES)
     if trouble == "damaged":
         (model / "images.bin").write_bytes(b"short")
     elif trouble == "incomplete":
         (model / "images.bin").unlink()
     scene = load_scene(folder)
-    if kind == "transforms":  # LLFF's principal points are in the middle
-        require_painted(scene)
+    require_painted(scene)
     reason = {"damaged": f"{model / 'images.bin'} is damaged: ", "incomplete": f"{model} has no images.bin: "}
-    said = next(note for note in scene.notes if note not in before)
-    assert said.startswith(f"not used: {reason.get(trouble, f'{model} names 9 photos, of which 9 are missing')}")
+    said = reason.get(trouble, f"{model} names 9 photos, of which 9 are missing")
+    assert "transforms.json" in scene.notes[0] and scene.notes[1].startswith(f"not used: {said}")
 
 
 def test_scannetpp(tmp_path):

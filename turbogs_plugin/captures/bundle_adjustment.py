@@ -77,7 +77,7 @@ class Pinholes:
         return cls(viewmats[:, :3, :3], viewmats[:, :3, 3], Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2], 0.5 * sizes[:, 0])
 
     def where(self, kept: np.ndarray, others: Pinholes) -> Pinholes:
-        """These where `kept` [V] bool, elsewhere the others."""
+        """Own cameras where `kept` [V] bool, the others elsewhere."""
         pairs = ((getattr(self, field.name), getattr(others, field.name)) for field in fields(Pinholes))
         return Pinholes(*(np.where(kept.reshape(-1, *[1] * (own.ndim - 1)), own, other) for own, other in pairs))
 
@@ -120,7 +120,7 @@ class Refinement:
     after: float
 
     def text(self, called: str) -> str:
-        """What was done, in a line. `called`: what the cameras are."""
+        """One line on the refinement. `called` names the cameras."""
         return (
             f"{self.count} of {len(self.cameras.focal)} {called} refined, each with a lens of its own: points are "
             f"{self.after:.2f} pixels from where photos show them, {self.before:.2f} before (medians)"
@@ -164,7 +164,7 @@ def refine_alone(
 
 
 def _median(errors: np.ndarray) -> float:
-    """0 where there are none."""
+    """Median of some errors; 0 where there are none."""
     return float(np.median(errors)) if len(errors) else 0.0
 
 
@@ -179,8 +179,8 @@ def farthest_match(cameras: Pinholes) -> float:
 
 
 def of_these_photos(cameras: Pinholes, points: np.ndarray, observations: Observations) -> bool:
-    """Whether observations are of the photos of these cameras, and not of others or in another size: half of the points
-    are within `farthest_match`."""
+    """True where observations belong to the photos of these cameras, not to others or to another size: half of the
+    points are within `farthest_match`."""
     return _median(reprojection_errors(cameras, points, observations)) <= farthest_match(cameras)
 
 

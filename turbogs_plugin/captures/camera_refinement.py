@@ -29,7 +29,7 @@ from turbogs_plugin.types import Cameras
 
 @dataclass(frozen=True)
 class RefinedCameras:
-    """What a scene's cameras are by where its photos show its points.
+    """Cameras of a scene by where its photos show its points.
 
     Args:
         together: training cameras and points.
@@ -110,7 +110,7 @@ def load_and_find(
 
 
 def _usable(views: PosedViews, points: np.ndarray) -> Observations | None:
-    """Where the views show points; None where that is not known, or is of other photos."""
+    """Observations of the views; None where there are none, or they belong to other photos."""
     observations = views.observations
     if observations is None or not len(observations):
         return None

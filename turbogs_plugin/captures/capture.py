@@ -1,4 +1,4 @@
-"""What a reader of one file format hands to `load_scene`: a capture in its own coordinates, checked, photos unread."""
+"""The capture that a reader of files hands to `load_scene`: in its own coordinates, checked, photos unread."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Capture:
         return np.array([size if lens is None else lens.photo_size for lens, size in both])
 
     def checked(self, source: Path) -> Capture:
-        """Itself. Raises `InputError` unless every number is finite and in range. `source` is named in messages."""
+        """This capture. Raises `InputError`, which names `source`, unless every number is finite and in range."""
         if not self.names:
             raise InputError(f"{source} has no images with a pose: reconstruct the capture again")
         bad = ~np.isfinite(self.points).all(axis=1)

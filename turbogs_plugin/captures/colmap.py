@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap", "colmap_sparse", "colmap_text", ".")
-"""Where a scene's reconstructions may lie, in order of preference: there, or in numbered folders of it."""
+"""Folders of a scene's reconstructions, in order of preference; or numbered folders in them."""
 STRAIGHT_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """Camera models that are a pinhole where all their parameters of distortion are 0."""
 
@@ -139,7 +139,7 @@ def _choice_note(model: Path) -> list[str]:
 
 
 def _lens(camera: pycolmap.Camera, model: Path, made: dict[tuple, Lens]) -> Lens | None:
-    """None for a pinhole camera, and for one of an impossible size, which `Capture.check` refuses.
+    """The lens of a camera; None for a pinhole, and for an impossible size, which `Capture.checked` refuses.
 
     Args:
         made: the lenses so far, by their numbers; a new one is added.
@@ -156,7 +156,7 @@ def _lens(camera: pycolmap.Camera, model: Path, made: dict[tuple, Lens]) -> Lens
 
 
 def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict[int, Lens | None]) -> Observations:
-    """Where images show points, in pixels of their pinhole cameras.
+    """Places where images show points, in pixels of their pinhole cameras.
 
     Features whose point is not there are left out.
 

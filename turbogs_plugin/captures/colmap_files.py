@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 FILES, SUFFIXES = ("cameras", "images", "points3D"), (".bin", ".txt")
 FEATURE = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
-"""Where an image shows something, and the identifier of the point that it is, or `NO_POINT`."""
+"""A place in an image, and the identifier of the point that it shows, or `NO_POINT`."""
 POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error", "<f8")])
 """A point, without its track."""
 NO_POINT = np.uint64(2**64 - 1)
@@ -228,7 +228,7 @@ class _Binary:
 
 
 def _records(path: Path, smallest: int) -> Iterator[_Words | _Binary]:
-    """What each record of a file is read from: a line of a text file, or a binary file.
+    """A reader of each record of a file: of a line of a text file, or of the binary file.
 
     Args:
         smallest: bytes of the smallest binary record.

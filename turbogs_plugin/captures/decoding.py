@@ -29,7 +29,7 @@ AS_STORED = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_270,
 }
-"""What turns an upright picture to how a file of this EXIF orientation has it; others have it upright."""
+"""Turn from an upright picture to the one that a file of an EXIF orientation stores; none for other orientations."""
 SMALLEST_SIDE = 4
 """The shorter side of a reduced photo has at least this many pixels; of fewer, nothing is left to see."""
 OPAQUE_SUFFIXES = (".jpg", ".jpeg")
@@ -74,7 +74,7 @@ def require_8_bits(image: Image.Image, path: Path) -> None:
 
 
 def is_transparent(image: Image.Image) -> bool:
-    """Whether an image may have pixels that are not opaque, by its header."""
+    """True where an image may have pixels that are not opaque, by its header."""
     return "A" in image.getbands() or "transparency" in image.info
 
 
@@ -137,7 +137,7 @@ def load_photos(
     pixels = colors.numpy()
 
     def load(view: int) -> bool:
-        """Whether the photo is opaque."""
+        """Decode a photo; True where it is opaque."""
         target = tuple(targets[view].tolist())
         photo = _decode(paths[view], tuple(sizes[view].tolist()), MODES[channels])
         lens = lenses[view]

@@ -1,4 +1,4 @@
-"""What a checkpoint says of its capture, so that no run is resumed with another one."""
+"""The fingerprint of a capture in a checkpoint, so that no run is resumed with another capture."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def frame_of_state(state: dict[str, Any]) -> Frame:
 
 
 def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
-    """How a capture differs from a saved one, in words; empty where it does not.
+    """The difference of a capture from a saved one, in words; empty where there is none.
 
     Args:
         saved, present: what `capture_state` gave, of one structure (`checkpoint.require_like`), among other things.

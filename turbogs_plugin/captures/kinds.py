@@ -1,4 +1,4 @@
-"""Which kind of capture a folder is, and where the capture is that a path beside it was given for."""
+"""Kinds of captures: the one that a folder is, and the capture near a path that is none."""
 
 from __future__ import annotations
 
@@ -55,20 +55,20 @@ def read_capture(scene: Path) -> Capture:
 
 
 def _kinds(scene: Path) -> list[tuple[str, Callable[[], Capture]]]:
-    """What a folder has of cameras, the first to be taken first: names of files or folders, and their readers."""
+    """Files or folders of cameras in a folder, in the order in which they are taken: names and readers."""
     model = find_model(scene)
     colmap = [] if model is None else [(str(model[0]), partial(read_colmap, scene, *model))]
     return [*colmap, *((name, partial(read, scene)) for name, read in READERS.items() if (scene / name).is_file())]
 
 
 def holds_photos_alone(scene: Path) -> bool:
-    """Whether a folder has photos, and nothing that says where they were taken from: no file of cameras, and no capture
+    """True where a folder has photos and nothing that says where they were taken from: no file of cameras, no capture
     in it or around it."""
     return scene.is_dir() and not _kinds(scene) and bool(find_photos(scene)[1]) and not capture_near(scene)
 
 
 def _no_capture(scene: Path) -> InputError:
-    """What a folder lacks that is no capture."""
+    """The error for a folder that is no capture: what it lacks."""
     if photos := find_photos(scene)[1]:
         return InputError(
             f"{scene} has {len(photos)} photos and nothing that says where they were taken from: find the cameras by "
@@ -94,8 +94,8 @@ def capture_near(path: Path) -> str:
     if inner:
         captures = named([f"{folder} has a {_mark(folder)}" for folder in inner])
         return f"{captures}: give {'that folder' if len(inner) == 1 else 'one of these folders'}"
-    parents = path.parents if path.parent.parts else path.resolve().parents
-    around = next((folder for folder in parents[: LEVELS + path.is_file()] if _mark(folder)), None)
+    parents = path.absolute().parents[: LEVELS + path.is_file()]
+    around = next((folder for folder in parents if _mark(folder)), None)
     return f"{path} lies in the capture {around} ({_mark(around)}): give that folder" if around else ""
 
 
@@ -119,7 +119,7 @@ def _folders(folder: Path, depth: int) -> Iterator[Path]:
 
 
 def _mark(folder: Path) -> str:
-    """What makes a folder a capture: ``sparse/0`` or the name of a file; empty for other folders.
+    """The mark of a capture in a folder, ``sparse/0`` or the name of a file; empty for other folders.
 
     A reconstruction in the very folder, or in numbered ones of it, does not: it is a part of a capture.
     """

@@ -203,7 +203,7 @@ def _load_views(
 
 
 def _masked_note(names: tuple[str, ...], masks: list[ViewMask | None], sizes: np.ndarray, seen: np.ndarray) -> str:
-    """How much is masked, and which views are left out for it, in one line; empty where nothing is masked."""
+    """One line on masked pixels and on views left out for them; empty where nothing is masked."""
     pixels = {view: mask.pixels for view, mask in enumerate(masks) if mask is not None}
     if not pixels:
         return ""

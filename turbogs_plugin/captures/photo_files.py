@@ -49,8 +49,7 @@ def find_photos(folder: Path) -> tuple[Path, list[Path]]:
 
 
 def unread(path: Path) -> str:
-    """What to do about photos and videos that are not read: the file `path` itself, or those in a folder; empty where
-    there are none."""
+    """Advice on photos and videos that are not read, of the file `path` or in a folder; empty where there are none."""
     files = _files(path, PHOTO_DEPTH) if path.is_dir() else [path] if path.is_file() else []
     photos = [file for file in files if file.suffix.lower() in OTHER_SUFFIXES]
     videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
@@ -225,6 +224,6 @@ def _moved(
 
 
 def _common_end(file: PurePosixPath, name: PureWindowsPath) -> int:
-    """How many folders at the end of both paths are equal."""
+    """The number of equal folders at the end of both paths."""
     pairs = zip(reversed(file.parts[:-1]), reversed(name.parts[:-1]), strict=False)
     return len(list(takewhile(lambda both: both[0] == both[1], pairs)))

@@ -190,7 +190,7 @@ def brown_projection(
 
 
 def undistortion_note(lenses: Sequence[Lens | None]) -> str:
-    """What was done to the photos of these lenses, one each, in one line; empty where nothing was."""
+    """One line on the photos of these lenses, one each, that were undistorted; empty where none was."""
     if not (bent := [lens for lens in lenses if lens is not None]):
         return ""
     different = {id(lens): lens for lens in bent}

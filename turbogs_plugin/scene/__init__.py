@@ -1,4 +1,4 @@
-"""What training sees of a capture: cameras, photos and points in one frame."""
+"""Scenes: cameras, photos and points of a capture in one frame, as training sees them."""
 
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.photos import Photos

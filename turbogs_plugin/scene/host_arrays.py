@@ -26,7 +26,7 @@ DISK_SHARE = 0.95
 MADV_WILLNEED = 3
 """Advice of ``madvise(2)`` on Linux: read ahead."""
 LARGE_FILES = Path("/var/tmp")
-"""Where large temporary files belong: /tmp often lies in memory."""
+"""Folder of large temporary files: /tmp often lies in memory."""
 
 
 def host_array(shape: Sequence[int], dtype: torch.dtype, what: str) -> Tensor:
@@ -50,12 +50,12 @@ def host_array(shape: Sequence[int], dtype: torch.dtype, what: str) -> Tensor:
 
 
 def too_large(size: int) -> bool:
-    """Whether an array of this many bytes takes more than `MEMORY_SHARE` of the memory that is free now."""
+    """True where an array of `size` bytes takes more than `MEMORY_SHARE` of the memory that is free now."""
     return size > MEMORY_SHARE * free_host_bytes()
 
 
 def in_file(array: Tensor) -> bool:
-    """Whether an array lies in a file."""
+    """True where an array lies in a file."""
     return getattr(array.untyped_storage(), "filename", None) is not None
 
 

@@ -227,7 +227,7 @@ class OffloadedPhotos(_Windowed, Photos):
         return self._window.arrays[0][:-1]
 
     def to(self, device: torch.device | str) -> OffloadedPhotos:
-        """These photos, with a window on that device."""
+        """The photos with a window on a device."""
         return self if torch.device(device) == self._window.device else OffloadedPhotos(self, device)
 
 

@@ -44,7 +44,7 @@ class Photos:
 
     @property
     def transparent(self) -> bool:
-        """Whether a pixel has an alpha."""
+        """True where pixels have an alpha."""
         return self.stored.shape[1] == 4
 
     def fetch(self, view_ids: Sequence[int]) -> None:

@@ -13,7 +13,7 @@ LONGEST_HEADER = 1 << 16
 
 
 class _AsciiLines(io.BufferedReader):
-    """A file whose lines are ASCII: trimesh takes those of a header for UTF-8, and comments may be in any encoding."""
+    """A file whose lines are ASCII: trimesh takes header lines for UTF-8, and comments may be in any encoding."""
 
     def readline(self, size: int | None = -1, /) -> bytes:
         return super().readline(size).decode("ascii", "replace").encode("ascii", "replace")

@@ -16,7 +16,7 @@ from turbogs_plugin.types import Cameras
 
 @dataclass(frozen=True)
 class Observations:
-    """Where V photos show points.
+    """Places where V photos show points.
 
     Args:
         pixels: [O, 2] float64; the centre of the first pixel is (0.5, 0.5).
@@ -89,7 +89,7 @@ class PosedImages:
         return replace(self.with_cameras_on(device), photos=self.photos.to(device))
 
     def with_cameras_on(self, device: torch.device | str) -> PosedImages:
-        """These photos where they are, with their cameras on a device."""
+        """The views with their cameras on a device, and photos where they are."""
         refined = None if self.refined is None else self.refined.to(device)
         return replace(self, cameras=self.cameras.to(device), refined=refined)
 

@@ -36,7 +36,7 @@ class Neighbours:
 class PhotoOrder:
     """The photos of each folder in the order of their names, in which numbers count as numbers.
 
-    Those of one folder are taken for one sequence: cameras, and programs that cut videos, number what they write.
+    The photos of one folder are taken for one sequence: cameras, and programs that cut videos, number what they write.
 
     Args:
         names: of all photos, with their folders.
