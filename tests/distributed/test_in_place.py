@@ -1,4 +1,4 @@
-"""The exchange in place: the same as by messages, to the bit, with memory that all processes read."""
+"""The exchange in place gives what messages give, to the bit, with memory that all processes read."""
 
 from __future__ import annotations
 

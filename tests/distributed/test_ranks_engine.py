@@ -248,7 +248,7 @@ def test_what_is_not_finite_in_one_process_is_skipped_by_all(several):
 def test_replicas_that_differ_end_the_run(several):
     count, results = several
     message = results["broken"]["differs"]
-    assert f"gaussians.means of rank {count - 1} differs from that of rank 0" in message
+    assert f"gaussians.means of rank {count - 1} differs from rank 0's" in message
     assert message.startswith("iteration 4:")
 
 

@@ -138,7 +138,7 @@ class InPlace:
             self._passes = memory, PassMemory(status.view(torch.int32), colors, radii.view(torch.int32), records)
 
     def _take(self, size: int, device: torch.device) -> PeerMemory | None:
-        """Memory for so many numbers of every process, or None for good."""
+        """Memory of every process, `size` numbers each; or None, for good."""
         memory = self._share(self._ranks, size, device) if self._possible else None
         self._possible = memory is not None
         return memory

@@ -55,7 +55,7 @@ def aligned_starts(sizes: Iterable[int]) -> list[int]:
 
 @dataclass
 class PeerMemory:
-    """As much memory of every process, for all to read and write.
+    """Memory of every process, of one size, for all to read and write.
 
     Args:
         parts: [size] float32 of each process, rank after rank.
