@@ -37,7 +37,7 @@ GPU = torch.device("cuda")
 @pytest.mark.parametrize("optimizer", ["moment_lm", "sparse_adam"])
 @pytest.mark.parametrize("unit", ["pixel", "tile"])
 def test_runs_of_rows_make_the_step_of_all_rows(optimizer, unit):
-    """From the same records: parameters, moments and statistics, to the bit."""
+    """Parameters, moments and statistics, from equal records, are equal to the bit."""
     scene = synthetic_scene(8, 160, 96, GPU, gaussians=5_001)
     settings = ["schedule.type=fixed", "schedule.views=4", f"optimizer.type={optimizer}", f"pixel_sampler.unit={unit}"]
     trainer = Trainer(load_config("turbogs", settings).without_plan(), scene, GPU)

@@ -252,18 +252,6 @@ def test_non_finite_losses_are_counted(capture, tmp_path, monkeypatch):
     assert "non-finite loss: 4" in outcome.folder.report.read_text()
 
 
-def test_the_disk_fills_up(capture, tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    stop_after(monkeypatch, 8, lambda trainer: monkeypatch.setattr("turbogs_plugin.files.os.fsync", full))
-    with pytest.raises(TrainingStopped, match=r"iteration 10: .*No space left.*iteration-000005\.pt") as stopped:
-        run.train(tiny_config(capture), tmp_path / "run")
-    assert str(stopped.value).count("iteration-000005") == 1
-    monkeypatch.undo()
-    assert saved(tmp_path / "run")["iteration"] == 5
-
-
 @pytest.fixture
 def elsewhere(capture, whole, tmp_path) -> Path:
     """A copy of the capture, of which a copy of the run tells."""

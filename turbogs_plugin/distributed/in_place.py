@@ -80,8 +80,10 @@ class InPlace:
             if self._model is not None:
                 synchronize(gaussians.device)  # as in `prepare`
             self._placed, self._others, self._model = None, [], None
-            self._model_room = with_room(starts[-1], LEAST)
+            self._model_room = max(LEAST, with_room(starts[-1]))
             self._model = self._take(self._model_room, gaussians.device)
+        if self._passes is None:  # before training: to map memory takes longer than an iteration
+            self._reserve(LEAST // 8, LEAST // (RECORD + RADII), gaussians.device)
         if self._model is None:
             return gaussians
         parts = self._model.parts
@@ -118,22 +120,25 @@ class InPlace:
                 synchronize(device)  # unmapping waits for the device, with all threads of Python held up
                 engine.lend(None)
                 self._passes = None
-            if slots > self._slots:
-                self._slots = with_room(slots, LEAST // 8)
-            if instances > self._instances:
-                self._instances = with_room(instances, LEAST // (RECORD + RADII))
-            sizes = PassStatus.SIZE, 3 * self._slots, RADII * self._instances, RECORD * self._instances
-            self._starts = aligned_starts(sizes)
-            memory = self._take(self._starts[-1], device)
-            if memory is not None:
-                part = memory.parts[self._ranks.rank]
-                parts = [part[start : start + size] for start, size in zip(self._starts, sizes, strict=False)]
-                status, colors, radii, records = parts
-                self._passes = memory, PassMemory(status.view(torch.int32), colors, radii.view(torch.int32), records)
+            slots = with_room(slots) if slots > self._slots else self._slots
+            instances = with_room(instances) if instances > self._instances else self._instances
+            self._reserve(slots, instances, device)
         return self._passes is not None and engine.lend(self._passes[1])
 
+    def _reserve(self, slots: int, instances: int, device: torch.device) -> None:
+        """Take memory for passes of these sizes."""
+        self._slots, self._instances = slots, instances
+        sizes = PassStatus.SIZE, 3 * slots, RADII * instances, RECORD * instances
+        self._starts = aligned_starts(sizes)
+        memory = self._take(self._starts[-1], device)
+        if memory is not None:
+            part = memory.parts[self._ranks.rank]
+            parts = [part[start : start + size] for start, size in zip(self._starts, sizes, strict=False)]
+            status, colors, radii, records = parts
+            self._passes = memory, PassMemory(status.view(torch.int32), colors, radii.view(torch.int32), records)
+
     def _take(self, size: int, device: torch.device) -> PeerMemory | None:
-        """Memory for so many numbers of every process, or None for good."""
+        """Memory of every process, `size` numbers each; or None, for good."""
         memory = self._share(self._ranks, size, device) if self._possible else None
         self._possible = memory is not None
         return memory

@@ -43,10 +43,9 @@ ALIGNMENT = 64
 """Alignment of what lies in a memory, in numbers of four bytes."""
 
 
-def with_room(numbers: int, least: int) -> int:
-    """Size of a memory that must grow to `numbers`: half more, as all processes wait for each other and their GPUs when
-    it grows. At least `least`."""
-    return max(least, numbers + numbers // 2)
+def with_room(numbers: int) -> int:
+    """Size of what must grow to `numbers`: half more, as all processes wait for each other and their GPUs."""
+    return numbers + numbers // 2
 
 
 def aligned_starts(sizes: Iterable[int]) -> list[int]:
@@ -56,7 +55,7 @@ def aligned_starts(sizes: Iterable[int]) -> list[int]:
 
 @dataclass
 class PeerMemory:
-    """As much memory of every process, for all to read and write.
+    """Memory of every process, of one size, for all to read and write.
 
     Args:
         parts: [size] float32 of each process, rank after rank.

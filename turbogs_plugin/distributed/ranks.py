@@ -166,8 +166,8 @@ def require_equal(ranks: ProcessRanks, state: dict[str, Any]) -> None:
     for rank, found in enumerate(ranks.gather_numbers([int(each) for each in equal])):
         if 0 in found:
             raise TrainingStopped(
-                f"iteration {state['iteration']}: {list(values)[found.index(0)]} of rank {rank} differs from that of "
-                "rank 0, though all make the same steps; do the GPUs and their software differ, or is one broken?"
+                f"iteration {state['iteration']}: {list(values)[found.index(0)]} of rank {rank} differs from rank 0's, "
+                "though all make equal steps; do the GPUs and their software differ, or is one broken?"
             )
 
 

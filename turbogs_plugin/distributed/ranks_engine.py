@@ -53,7 +53,7 @@ from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, Gaussian
 
 LAG = 4
 """Passes after which all processes look at the flags of a pass, and wait for them if need be: so all know of them at
-the same place, and no host runs farther ahead of its GPU."""
+one place, and no host runs farther ahead of its GPU."""
 
 OWNERS_FROM = 4_000_000
 """Rows of a batch, views times Gaussians, from which on two processes that send messages gain by owners of rows.

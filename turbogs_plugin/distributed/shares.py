@@ -16,7 +16,7 @@ import numpy as np
 from turbogs_plugin.types import PixelSamples
 
 NEARLY = 0.05
-"""A share may be so much larger or smaller, of an even one, for the sake of ending with a view."""
+"""Largest difference from an even share, as a part of it, for the sake of ending with a view."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def shares_of(samples: PixelSamples, count: int) -> list[Share]:
 
 @lru_cache(maxsize=256)
 def _known(ends: Callable[[], tuple[np.ndarray, np.ndarray]], count: int) -> list[Share]:
-    """Kept, as the draws of most iterations have the same sizes."""
+    """`_cut`, whose results are kept: the draws of most iterations have equal sizes."""
     return _cut(*ends(), count)
 
 
