@@ -207,12 +207,10 @@ class ReportConfig:
     """The report.
 
     Args:
-        lpips_weights: local file with the backbone's weights (torchvision's VGG16), or null: LPIPS is not computed.
         tensorboard: also write the history and pictures of test views for TensorBoard, into the run's folder at each
             evaluation; needs the extra ``tensorboard``.
     """
 
-    lpips_weights: str | None = None
     tensorboard: bool = False
 
 

@@ -80,22 +80,21 @@ class TrainingLoop:
         clock.seconds = self.ranks.agree(clock.seconds)
         for listener in self.listeners:
             listener.begun(self)
-        pace.start(trainer.iteration, clock.seconds)
         while not (self.finished or self.stopped):
             mark = pace.next_mark(trainer.iteration, clock.seconds)
             self.advance(mark)
             if trainer.iteration < mark:  # stopped on the way
                 break
-            due = pace.reached(trainer.iteration, clock.seconds)
+            evaluate, save = pace.reached(trainer.iteration, clock.seconds)
             trainer.set_length(pace.iterations, pace.refine_until)
             if self.finished:
                 trainer.conclude()
-            if due.evaluate or due.save:
+            if evaluate or save:
                 trainer.complete()
-            if due.evaluate:
+            if evaluate:
                 for listener in self.listeners:
                     listener.evaluation_due(self)
-            if due.save:
+            if save:
                 for listener in self.listeners:
                     listener.checkpoint_due(self)
 

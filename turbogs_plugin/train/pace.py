@@ -6,7 +6,7 @@ are timed and thrown away, then again and again while it trains.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
@@ -26,13 +26,6 @@ TRIAL_ITERATIONS = {"cuda": 20, "cpu": 2}
 """Iterations that are timed before a run with a time budget. As many before them load code and size buffers."""
 
 
-class Due(NamedTuple):
-    """Work at a stop."""
-
-    evaluate: bool
-    save: bool
-
-
 class IterationPace:
     """A fixed number of iterations.
 
@@ -47,18 +40,15 @@ class IterationPace:
         self._evaluations = train.evaluation_iterations()
         self._save_every = train.checkpoint_every or self.iterations
 
-    def start(self, iteration: int, seconds: float) -> None:
-        """Begin or go on, after this many finished iterations and seconds of training."""
-
     def next_mark(self, iteration: int, seconds: float) -> int:
         """The finished iteration to stop at next."""
         save = iteration - iteration % self._save_every + self._save_every
         return min(save, self.iterations, *(mark for mark in self._evaluations if mark > iteration))
 
-    def reached(self, iteration: int, seconds: float) -> Due:
-        """Work that is due where training has stopped."""
+    def reached(self, iteration: int, seconds: float) -> tuple[bool, bool]:
+        """Whether an evaluation is due where training has stopped, and whether a checkpoint is."""
         save = iteration == self.iterations or (iteration > 0 and iteration % self._save_every == 0)
-        return Due(iteration in self._evaluations, save)
+        return iteration in self._evaluations, save
 
     def state_dict(self) -> dict[str, Any]:
         return {}
@@ -84,26 +74,23 @@ class TimePace:
         self._seconds = seconds
         self._refine_share = min(1.0, self.refine_until / self.iterations)
         self._mean = 0.0  # seconds of a recent iteration; 0: none was timed
-        self._last = (0, 0.0)  # iteration and seconds at the last stop
+        self._last = (0, 0.0)  # iteration and seconds where the present stretch began
         self._fractions = sorted({*train.evaluate_at, 1.0})
         self._save_every = train.checkpoint_every
         self._evaluated = self._saved = 0
 
-    def start(self, iteration: int, seconds: float) -> None:
-        self._last = (iteration, seconds)
-
     def next_mark(self, iteration: int, seconds: float) -> int:
+        self._last = (iteration, seconds)
         left = max(0.0, self._seconds - seconds)
         mean = self._mean or left / max(1, self.iterations - iteration)
         stretch = min(MARK_SHARE * self._seconds, 0.5 * left)
         return min(self.iterations, iteration + max(1, int(stretch / max(1e-9, mean))))
 
-    def reached(self, iteration: int, seconds: float) -> Due:
+    def reached(self, iteration: int, seconds: float) -> tuple[bool, bool]:
         before, started = self._last
         if iteration > before:
             latest = (seconds - started) / (iteration - before)
             self._mean = 0.5 * (self._mean + latest) if self._mean else latest
-            self._last = (iteration, seconds)
             left = max(0.0, self._seconds - seconds)
             self.iterations = iteration + int(left / max(1e-9, self._mean) + 0.5)  # half an iteration early or late
             if iteration < self.refine_until:  # density control that has ended does not restart
@@ -111,10 +98,10 @@ class TimePace:
         finished, every = iteration >= self.iterations, self._save_every
         passed = sum(fraction <= seconds / self._seconds for fraction in self._fractions)
         save = finished or bool(every and iteration // every > self._saved // every)
-        due = Due(finished or passed > self._evaluated, save)
+        evaluate = finished or passed > self._evaluated
         self._evaluated = max(passed, self._evaluated)
         self._saved = iteration if save else self._saved
-        return due
+        return evaluate, save
 
     def state_dict(self) -> dict[str, Any]:
         return {
@@ -152,17 +139,16 @@ def fitted_to_time(config: Config, scene: Scene, device: torch.device, ranks: Ra
     budget = config.budget.seconds()
     if budget is None:
         return config, 0.0
-    count = TRIAL_ITERATIONS[device.type]
-    whole, timed = TrainingClock(device), TrainingClock(device)
-    with whole:
-        trial = Trainer(without_growth(config), scene, device, engine=ranks.engine(device))
-        trial.iteration = config.train.iterations // 2  # views, pixels and bands of an iteration are near their means
-        for clock in (TrainingClock(device), timed):
-            with clock:
-                for _ in range(count):
-                    trial.step()
-            trial.repeat_lost(wait=True)
-        del trial
-        free_device_memory(device)
-    spent, mean = ranks.agree((whole.seconds, timed.seconds / count))
+    count, clock = TRIAL_ITERATIONS[device.type], TrainingClock(device)
+    trial = Trainer(without_growth(config), scene, device, engine=ranks.engine(device))
+    trial.iteration = int(config.train.iterations) // 2  # views, pixels and bands of an iteration are near their means
+    for _ in range(2):  # the first time loads code and sizes buffers
+        begun = clock.seconds
+        with clock:
+            for _ in range(count):
+                trial.step()
+        trial.repeat_lost(wait=True)
+    del trial
+    free_device_memory(device)
+    spent, mean = ranks.agree((clock.seconds, (clock.seconds - begun) / count))
     return with_iterations(config, max(1, int((budget - spent) / max(1e-9, mean)))), spent
