@@ -215,7 +215,7 @@ def test_progress_is_a_bar_on_a_terminal(capsys, monkeypatch):
 
 @pytest.mark.parametrize("strips", [0, 1])
 def test_no_more_strips_than_the_bound(tmp_path, monkeypatch, strips):
-    monkeypatch.setattr("turbogs_plugin.report.pages.STRIPS", strips)
+    monkeypatch.setattr("turbogs_plugin.report.run_report.STRIPS", strips)
     config = tiny_config(tiny_capture(tmp_path), "train.iterations=1", "scene.test_every=4")
     folder = run.train(config, tmp_path / "run", write_report).folder
     assert len(list((folder.path / "report").glob("test-*.jpg"))) == strips

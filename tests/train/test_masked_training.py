@@ -148,15 +148,6 @@ def test_a_mask_changes_no_gradient_of_what_it_leaves(scene):
         assert float((found - expected).norm() / expected.norm()) < 1e-3, name
 
 
-def test_only_live_tiles_are_drawn_from(scene):
-    trainer = Trainer(tiny_config("capture").without_plan(), scene, CPU)
-    trainer.initialise_maps()
-    samples = trainer.pixel_sampler.sample(trainer.maps, (0, 6), 0.2, trainer.now)
-    live = [len(np.unique(np.argwhere(disc_mask(1)) // 16, axis=0)), 9]  # the last view has no mask
-    assert live[0] < 9
-    assert torch.bincount(torch.searchsorted(torch.tensor([9]), samples.tile_ids.long(), right=True)).tolist() == live
-
-
 # ---- Evaluation ----------------------------------------------------------------------------------------------------
 
 

@@ -134,16 +134,6 @@ def test_a_cap_without_room_beside_the_backdrop_is_refused(capture):
         Trainer(config, load_scene(capture), torch.device("cpu"))
 
 
-def test_a_scene_that_does_not_fit_is_refused(capture, tmp_path, monkeypatch):
-    def full(trainer, *arguments, **options):
-        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
-
-    monkeypatch.setattr(Trainer, "__init__", full)
-    with pytest.raises(InputError, match="'capture' does not fit into the device's memory"):
-        run.train(tiny_config(capture), tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.fixture
 def stopped(capture, tmp_path, monkeypatch) -> Path:
     """The folder of a run with a checkpoint of its fifth iteration."""
@@ -160,6 +150,17 @@ def change_config(folder: Path, **sections: dict) -> None:
     for name, fields in sections.items():
         mapping[name] |= fields
     (folder / "config.yaml").write_text(resolve(mapping).to_yaml())
+
+
+@pytest.mark.parametrize("place", [(Trainer, "__init__"), (session, "place_views")])
+def test_a_capture_that_does_not_fit_is_refused(capture, tmp_path, monkeypatch, place):
+    def full(*arguments, **options):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(*place, full)
+    with pytest.raises(InputError, match="'capture' does not fit into the device's memory: use train.photos_place=ho"):
+        run.train(tiny_config(capture), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("place", [(Trainer, "__init__"), (Trainer, "load_state_dict"), (session, "place_views")])
@@ -205,20 +206,20 @@ def test_memory_that_is_spent_names_what_may_fit(capture, tmp_path, monkeypatch)
 
 @pytest.mark.parametrize("every", [0, 1, 4, 5, 10, 11])
 def test_stops_by_iterations_evaluate_and_save_where_asked(every):
-    train = TrainConfig(iterations=10, evaluate_at=(0.3, 0.5), checkpoint_every=every)
-    pace, iteration, dues = pacing.IterationPace(train), 0, {}
+    train = TrainConfig(iterations=10, evaluate_at=(0.01, 0.3, 0.5), checkpoint_every=every)
+    pace, iteration, dues = pacing.Pace(train), 0, {}
     while iteration < pace.iterations:
         iteration = pace.next_mark(iteration, 0.0)
         dues[iteration] = pace.reached(iteration, 0.0)
     saves = {*range(every, 10, every), 10} if every else {10}
     assert {iteration for iteration, due in dues.items() if due[1]} == saves
-    assert {iteration for iteration, due in dues.items() if due[0]} == {3, 5, 10}
-    assert dues.keys() == saves | {3, 5, 10}
+    assert {iteration for iteration, due in dues.items() if due[0]} == {1, 3, 5, 10}
+    assert dues.keys() == saves | {1, 3, 5, 10}
 
 
 def test_stops_by_time_evaluate_once_a_fraction_and_save_at_intervals():
     train = TrainConfig(iterations=100, refine_until=70, evaluate_at=(0.25, 0.5), checkpoint_every=40)
-    pace = pacing.TimePace(train, 10.0)
+    pace = pacing.Pace(train, 10.0)
     iteration, seconds, dues = 0, 0.0, []
     while iteration < pace.iterations:
         mark = pace.next_mark(iteration, seconds)
@@ -237,7 +238,7 @@ def paced(stop_after: float = math.inf) -> list[tuple[int, float, int, int]]:
     """(iteration, seconds, iterations planned, end of density control) at each stop of a run of 20 s, whose model grows
     to 20 times its size; stopped and resumed once."""
     train = TrainConfig(iterations=5000, refine_until=3500)
-    pace = pacing.TimePace(train, 20.0)
+    pace = pacing.Pace(train, 20.0)
     iteration, seconds, gaussians, stops = 0, 0.0, 20_000, []
     while iteration < pace.iterations:
         mark = pace.next_mark(iteration, seconds)
@@ -249,7 +250,7 @@ def paced(stop_after: float = math.inf) -> list[tuple[int, float, int, int]]:
         stops.append((iteration, seconds, pace.iterations, pace.refine_until))
         if seconds > stop_after:
             state, stop_after = pace.state_dict(), math.inf
-            pace = pacing.TimePace(train, 20.0)
+            pace = pacing.Pace(train, 20.0)
             require_like(state, pace.state_dict(), "pace")
             pace.load_state_dict(state)
     return stops

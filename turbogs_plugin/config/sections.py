@@ -178,11 +178,6 @@ class TrainConfig:
         """Whether `init` names a model's file."""
         return self.init not in ("points", "random")
 
-    def evaluation_iterations(self) -> set[int]:
-        """Counts of finished iterations after which to evaluate."""
-        total = self.written_iterations
-        return {0, total, *(max(1, round(part * total)) for part in self.evaluate_at)}
-
     def sh_degree_at(self, iteration: int) -> int:
         """Degree of the bands in use at an iteration."""
         return self.sh_degree if self.starts_from_model else min(self.sh_degree, iteration // self.sh_interval)

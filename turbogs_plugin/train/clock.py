@@ -1,5 +1,4 @@
-"""The two clocks of a run: seconds of training, which decide what counts as time, and seconds on the wall, from the
-start of the command until the model is written, with the parts that they went into.
+"""Seconds on the wall, from the start of a command until the model is written, with the parts that they went into.
 
 A command makes its wall clock before it loads torch, so this module does without.
 """
@@ -8,54 +7,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, write_text_atomically
-
-if TYPE_CHECKING:
-    import torch
-
-
-class TrainingClock:
-    """Seconds of training. Use it as a context around training alone; it waits for the GPU at both ends.
-
-    Args:
-        seconds: training time that passed before.
-    """
-
-    def __init__(self, device: torch.device, seconds: float = 0.0) -> None:
-        self.device = device
-        self.seconds = seconds
-
-    def __enter__(self) -> TrainingClock:
-        _wait_for(self.device)
-        self._started = time.perf_counter()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        _wait_for(self.device)
-        self.seconds += time.perf_counter() - self._started
-
-    @contextmanager
-    def stopped(self) -> Iterator[None]:
-        """Within the clock's own context: time spent inside is not training and does not count."""
-        _wait_for(self.device)
-        began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._started += time.perf_counter() - began
-
-
-def _wait_for(device: torch.device) -> None:
-    from turbogs_plugin.device import synchronize  # imports torch
-
-    synchronize(device)
 
 
 class WallClock:

@@ -10,9 +10,8 @@ from collections.abc import Iterable
 from signal import SIGTERM
 
 from turbogs_plugin.distributed.ranks import ONE, Ranks
-from turbogs_plugin.train.clock import TrainingClock
 from turbogs_plugin.train.history import Evaluation
-from turbogs_plugin.train.pace import IterationPace, Pace
+from turbogs_plugin.train.pace import Pace, TrainingClock
 from turbogs_plugin.train.trainer import Trainer
 
 
@@ -58,7 +57,7 @@ class TrainingLoop:
         ranks: Ranks = ONE,
     ) -> None:
         self.trainer = trainer
-        self.pace = pace or IterationPace(trainer.config.train)
+        self.pace = pace or Pace(trainer.config.train)
         self.listeners = list(listeners)
         self.clock = TrainingClock(trainer.device, seconds)
         self.ranks = ranks

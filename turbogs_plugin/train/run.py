@@ -25,7 +25,7 @@ from turbogs_plugin.train.clock import WallClock, WallRecord
 from turbogs_plugin.train.history import rewind_history
 from turbogs_plugin.train.inputs import open_scene, open_started, resolve_device
 from turbogs_plugin.train.loop import TrainingLoop
-from turbogs_plugin.train.pace import fitted_to_time, pace_of
+from turbogs_plugin.train.pace import Pace, fitted_to_time
 from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.train.saved_model import require_model
 from turbogs_plugin.train.session import Report, RunSession, Watch
@@ -79,7 +79,7 @@ def new_loop(config: Config, scene: Scene, device: torch.device, ranks: Ranks = 
         config = resolve(ranks.agree(config.to_mapping()))
     config, seconds = fitted_to_time(within_memory(config, scene), scene, device, ranks)
     trainer = Trainer(config, scene, device, engine=ranks.engine(device))
-    return TrainingLoop(trainer, pace_of(config), seconds=seconds, ranks=ranks)
+    return TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), seconds=seconds, ranks=ranks)
 
 
 def fit(scene: Scene | Path | str, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussians:
@@ -190,7 +190,7 @@ def resume(
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
         resuming = state is not None
         trainer = Trainer(config, scene, device, resuming, ranks.engine(device))
-        loop = TrainingLoop(trainer, pace_of(config), ranks=ranks)
+        loop = TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), ranks=ranks)
         session = RunSession(folder, plan, scene, loop, clock)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))

@@ -97,7 +97,8 @@ class RunSession(Listener):
                 self.clock.mark("training")
                 if loop.finished and ranks.first:
                     trainer.require_finite()
-                    save_ply(trainer.gaussians, self.folder.model, self.scene.frame)
+                    with ranks.working():
+                        save_ply(trainer.gaussians, self.folder.model, self.scene.frame)
                     self.clock.mark("model")
                 seconds = 0.0 if finished_before else self.clock.seconds
                 if trainer.iteration != self._saved_at:
