@@ -124,7 +124,7 @@ def test_a_saved_run_is_shown_as_its_trainer_is(capture, tmp_path):
 
 
 def mean_of(table: str, column: str) -> float:
-    """That of the last line of a Markdown table."""
+    """The value of a column in the last line of a Markdown table."""
     lines = [line.split(" | ") for line in table.splitlines() if line.startswith("| ")]
     return float(lines[-1][[head.strip("| ") for head in lines[0]].index(column)])
 

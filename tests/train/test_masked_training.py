@@ -56,7 +56,7 @@ def scene(capture):
 
 
 def with_other_masked_pixels(scene):
-    """The same scene, whose masked pixels have other colours."""
+    """A copy of the scene, whose masked pixels have other colours."""
     views = scene.train
     masked = ~torch.cat([views.masks.image(view).reshape(-1) for view in range(len(views))])
     colors = views.photos.colors.clone()

@@ -53,7 +53,7 @@ def averaged(capture) -> tuple[Trainer, Kept]:
 
 @pytest.fixture(scope="module")
 def whole(capture, tmp_path_factory) -> RunSession:
-    """The same training as a run."""
+    """A run with the settings of `averaged`."""
     return train(tiny_config(capture, *AVERAGED), tmp_path_factory.mktemp("runs") / "whole")
 
 
@@ -77,7 +77,7 @@ def test_it_is_the_mean_of_what_was_added():
 
 
 def test_it_goes_into_another_trainers_parameters():
-    """Of gsplat's splats: a dictionary of parameters, whose rows its strategies change."""
+    """gsplat has a dictionary of parameters, whose rows its strategies change."""
     splats = torch.nn.ParameterDict(tensors(1.0))
     mean = ParameterMean(0.5, splats)
     mean.add(splats)

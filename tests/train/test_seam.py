@@ -90,7 +90,7 @@ def test_an_optimizer_of_its_own_code_trains_as_its_rule_would(capture, make):
 
 @pytest.mark.parametrize("calls", [0, 2])
 def test_statistics_are_written_once_whatever_the_optimizer_does(capture, calls):
-    """It may leave an iteration out or make two steps of it: the density window gets each backward pass once."""
+    """Statistics of density control get each backward pass once, whether an optimizer makes no step of it or two."""
     usual, odd = make_trainer(capture), make_trainer(capture)
     odd.optimizer = OwnCode(MomentLMOptimizer())
     odd.optimizer.calls = calls

@@ -144,7 +144,7 @@ def stopped(capture, tmp_path, monkeypatch) -> Path:
 
 
 def change_config(folder: Path, **sections: dict) -> None:
-    """Of a run."""
+    """Rewrite sections of a run's configuration."""
     config = run.RunFolder(folder).read_config()
     mapping = config.to_mapping()
     for name, fields in sections.items():

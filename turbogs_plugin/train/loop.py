@@ -16,7 +16,7 @@ from turbogs_plugin.train.trainer import Trainer
 
 
 class Listener:
-    """Its methods are called when something happens in a training. A listener overrides those it needs."""
+    """A listener of a training, whose methods are called when something happens. Subclasses override what they need."""
 
     def begun(self, loop: TrainingLoop) -> None:
         """The error maps are there; this process has not yet made an iteration."""

@@ -47,10 +47,11 @@ def plan_run(config: Config) -> Plan:
 
 
 def require_possible(config: Config) -> None:
-    """Refuse a device, or a limit of its memory, that this machine does not have, before photos are looked at.
+    """Refuse a device or a limit of its memory that this machine lacks, and a model to start from that is not there,
+    before photos are looked at.
 
     Raises:
-        InputError: the machine lacks it.
+        InputError: one of these.
     """
     if config.train.device == "cuda":
         resolve_device("cuda")
@@ -201,7 +202,7 @@ def resume(
 
 
 def _posed_capture(config: Config, out: Path) -> str:
-    """The path of the capture; where that is of photos alone, of their reconstruction, which is made."""
+    """The path of the capture; for photos alone, the path of their reconstruction, which is made."""
     if not holds_photos_alone(Path(config.scene.path)):
         return config.scene.path
     from turbogs_plugin.reconstruct.run import reconstruct_beside  # no other run needs that room

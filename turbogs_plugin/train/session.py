@@ -28,7 +28,7 @@ from turbogs_plugin.train.run_files import RunFolder
 Report = Callable[["RunSession"], object]
 """Writes the report of a finished run."""
 Watch = Sequence[Callable[["RunSession"], Listener]]
-"""Each is called with a run before it trains, and gives one more listener of the first process's loop."""
+"""Functions that are called with a run before it trains, and give one more listener of its first process each."""
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -188,11 +188,9 @@ class Trainer(TrainingState):
             restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
 
 
-def require_samples(samples: Any, view_ids: Sequence[int], name: str) -> None:
+def require_samples(samples: PixelSamples, view_ids: Sequence[int], name: str) -> None:
     """Raise `InputError` unless `samples` of the pixel sampler `name` are of these views, in this order: photos and
     error maps of other views would be compared with renders of these."""
-    if not isinstance(samples, PixelSamples):
-        raise InputError(f"pixel_sampler.type '{name}' returned {_described(samples)}, not PixelSamples")
     if samples.view_ids != tuple(view_ids):
         raise InputError(
             f"pixel_sampler.type '{name}' returned samples of views {samples.view_ids}, asked for {tuple(view_ids)}: "
@@ -200,18 +198,10 @@ def require_samples(samples: Any, view_ids: Sequence[int], name: str) -> None:
         )
 
 
-def require_output(output: Any, colors: Tensor, name: str) -> None:
-    """Raise `InputError` unless `output` of the loss `name` is a `LossOutput` whose shapes fit colours [P, 3]."""
-    if not isinstance(output, LossOutput):
-        raise InputError(f"loss.type '{name}' returned {_described(output)}, not a LossOutput")
+def require_output(output: LossOutput, colors: Tensor, name: str) -> None:
+    """Raise `InputError` unless the shapes of a `LossOutput` of the loss `name` fit colours [P, 3]."""
     shapes = {"loss": (), "color_gradients": tuple(colors.shape), "pixel_errors": (len(colors),)}
     for field, shape in shapes.items():
-        value = getattr(output, field)
-        if not isinstance(value, Tensor) or value.shape != shape:
-            raise InputError(
-                f"loss.type '{name}' returned {_described(value)} as {field}, not a tensor of shape {shape}"
-            )
-
-
-def _described(value: Any) -> str:
-    return f"a tensor of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"'{type(value).__name__}'"
+        found = tuple(getattr(output, field).shape)
+        if found != shape:
+            raise InputError(f"loss.type '{name}' returned {field} of shape {found}, not {shape}")
