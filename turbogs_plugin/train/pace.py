@@ -101,7 +101,8 @@ class Pace:
         before, began = self._last
         if self._budget is not None and iteration > before:
             latest = (seconds - began) / (iteration - before)
-            self._mean = 0.5 * (self._mean + latest) if self._mean else latest
+            weight = min(0.5, (seconds - began) / (MARK_SHARE * self._budget)) if self._mean else 1.0
+            self._mean += weight * (latest - self._mean)
             left = max(0.0, self._budget - seconds)
             self.iterations = iteration + int(left / max(1e-9, self._mean) + 0.5)  # half an iteration early or late
             if iteration < self.refine_until:  # density control that has ended does not restart
