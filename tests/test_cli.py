@@ -220,25 +220,25 @@ def test_a_run_without_or_with_a_broken_checkpoint(turbogs, finished, capture, t
     broken = Path(shutil.copytree(finished, tmp_path / "broken"))
     checkpoint = next((broken / "checkpoints").glob("*.pt"))
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
-    for arguments in (["eval", broken], ["export", broken], ["train", "--resume", broken]):
+    for arguments in (["eval", broken], ["export", broken]):
         assert_refused(turbogs(*arguments), "cannot be used", checkpoint.name)
     shutil.rmtree(broken / "checkpoints")
     before = tree(broken)
     for verb in ("eval", "render", "export"):
         assert_refused(turbogs(verb, broken), "has no checkpoint", f"{broken / 'model.ply'} --scene {capture}")
-    assert_refused(turbogs("train", "--resume", broken), f"'{broken}' is finished", "model.ply", "another --out")
+    (broken / "report.md").unlink()
+    del before["report.md"]
+    assert_refused(turbogs("train", "--resume", broken), f"'{broken}' is finished", "model.ply")
     assert tree(broken) == before
-    (broken / "model.ply").unlink()
-    assert_refused(turbogs("eval", broken), "no checkpoint yet", f"turbogs train --resume {broken}")
 
 
 def test_to_go_on_with_a_finished_run_says_so_and_changes_no_file(turbogs, finished, tmp_path):
     run = Path(shutil.copytree(finished, tmp_path / "run"))
     before = tree(run)
-    assert turbogs("train", "--resume", run) == (0, f"{run} is finished: 2 of 2 iterations\n", "")
+    assert turbogs("train", "--resume", run) == (0, f"{run} is finished: its model is {run / 'model.ply'}\n", "")
     assert tree(run) == before
     (run / "report.md").unlink()
-    assert turbogs("train", "--resume", run, "--no-report")[1].endswith("is finished: 2 of 2 iterations\n")
+    assert turbogs("train", "--resume", run, "--no-report")[1].endswith("model.ply\n")
     assert turbogs("train", "--resume", run)[0] == 0 and (run / "report.md").is_file(), "what was left to do"
 
 
@@ -303,7 +303,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypa
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *TINY)
     assert code == 130 and out == ""
     assert f"turbogs train --resume {tmp_path / 'run'}" in err
-    assert (tmp_path / "run" / "checkpoints" / "latest").read_text() == "iteration-000003.pt"
+    assert (tmp_path / "run/checkpoints/iteration-000003.pt").is_file()
     monkeypatch.undo()
 
 

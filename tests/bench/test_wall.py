@@ -7,7 +7,6 @@ from helpers.framework_runs import tiny_capture
 
 from turbogs_plugin.bench import wall
 from turbogs_plugin.bench.wall import REST, WallRun, bench_wall, wall_lines
-from turbogs_plugin.train.session import CHECKPOINT, MODEL
 
 
 def test_the_parts_of_a_run_are_all_of_its_time(turbogs, tmp_path):
@@ -16,7 +15,7 @@ def test_the_parts_of_a_run_are_all_of_its_time(turbogs, tmp_path):
     assert code == 0
     median = json.loads((tmp_path / "w.json").read_text())["median"]
     assert sum(median["parts"].values()) == pytest.approx(median["seconds"])
-    assert {"interpreter and imports", "photos", "training", MODEL, CHECKPOINT, REST} <= set(median["parts"])
+    assert {"interpreter and imports", "photos", "training", "model", "checkpoints", REST} <= set(median["parts"])
     assert 0 < median["train_seconds"] < median["model_seconds"] < median["seconds"]
     assert median["model_seconds"] - 0.01 < WallRun(**median).ready_seconds < median["seconds"]
     assert all(part in out for part in (*median["parts"], "whole command", "from photos to the first iteration"))
@@ -29,4 +28,9 @@ def test_the_run_in_the_middle_is_shown(monkeypatch):
     assert measured["command"] == ["turbogs", "train", "capture", "--device", "cpu"], "no path of this machine"
     assert measured["median"]["seconds"] == 9.5 and "4.00, 25.00, 4.50" in wall_lines(measured)[-1]
     assert WallRun(9.0, 5.0, 8.0, {"plan": 4.0, "photos": 1.0}).to_first_iteration == 4.0
-    assert WallRun(9.0, 5.0, 8.0, {CHECKPOINT: 0.5, REST: 0.25}).beside_training == 3.25
+    assert WallRun(9.0, 5.0, 8.0, {REST: 0.25}).beside_training == 3.75
+
+
+def test_what_the_command_refuses_is_told(turbogs):
+    code, out, err = turbogs("bench", "wall", "--scene", "nowhere", "--repeats", 1, "--device", "cpu")
+    assert (code, out) == (2, "") and err.count("\n") == 1 and "no such scene: nowhere" in err

@@ -217,11 +217,6 @@ def test_bands_open_on_their_schedule():
     assert [train.sh_degree_at(iteration) for iteration in (0, 9, 10, 19, 20, 1000)] == [0, 0, 1, 1, 2, 2]
 
 
-def test_the_start_and_the_end_are_always_evaluated():
-    train = load_config("turbogs", ["train.iterations=10", "train.evaluate_at=[0.01, 0.5]"]).train
-    assert train.evaluation_iterations() == {0, 1, 5, 10}
-
-
 @pytest.mark.parametrize(
     ("text", "overrides"),
     [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import multiprocessing
 import os
 import random
@@ -120,7 +119,7 @@ def test_a_run_goes_on_with_another_number_of_processes(of_two, capture, tmp_pat
     for count in (1, 2, 4):
         folder = tmp_path / str(count)
         shutil.copytree(of_two, folder / "run")
-        (folder / "run/checkpoints/latest").write_text("iteration-000010.pt")
+        (folder / "run/checkpoints/iteration-000014.pt").unlink()
         if count == 1:
             run.resume(folder / "run")
         else:
@@ -213,7 +212,7 @@ def test_torchrun_starts_a_lost_run_again_from_its_checkpoint(capture, tmp_path,
     words += ["train.iterations=10", "schedule.max_views=2"]
     elastic_launch(config, lost_once)(words)
     assert read_history(run_folder / "history.jsonl")[-1].iteration == 10
-    assert math.isnan(WallRecord.read(run_folder / "wall.json").wall_seconds), "no process was lost"
+    assert WallRecord.read(run_folder / "wall.json").wall_seconds is None, "no process was lost"
 
 
 def test_the_command_starts_processes_itself(capture, tmp_path, turbogs, monkeypatch, handlers):

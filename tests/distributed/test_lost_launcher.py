@@ -67,7 +67,7 @@ def test_processes_of_a_training_end_with_their_launcher(capture, tmp_path):
     checkpoints = tmp_path / "run/checkpoints"
     words = ["train", str(capture), "--out", str(tmp_path / "run"), "--gpus", "2", "--device", "cpu", "--no-report"]
     words += [*TINY, *ENDLESS]
-    assert not left_after_its_kill(words, tmp_path, (checkpoints / "latest").is_file)
+    assert not left_after_its_kill(words, tmp_path, lambda: latest_checkpoint(checkpoints) is not None)
     newest = latest_checkpoint(checkpoints)
     iteration = load_checkpoint(newest)["trainer"]["iteration"]
     assert iteration >= 3 and newest.name == f"iteration-{iteration:06d}.pt"

@@ -25,8 +25,7 @@ from turbogs_plugin.model.gsplat_file import save_gsplat
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.train import inputs, run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
-from turbogs_plugin.train.given_model import load_given
-from turbogs_plugin.train.saved_model import load_model
+from turbogs_plugin.train.saved_model import load_given, load_model
 from turbogs_plugin.types import Gaussians
 
 MEMORY = 64 * 2**20

@@ -45,35 +45,12 @@ def test_only_the_newest_two_stay(tmp_path, iterations):
     for count, iteration in enumerate(iterations, start=1):
         save_checkpoint(tmp_path, iteration, state(iteration))
         kept = {f"iteration-{number:06d}.pt" for number in iterations[max(0, count - 2) : count]}
-        assert {file.name for file in tmp_path.iterdir()} == kept | {"latest"}
+        assert {file.name for file in tmp_path.iterdir()} == kept
         assert_newest(tmp_path, iteration)
-
-
-def test_the_one_just_written_stays_beside_leftovers_of_a_later_iteration(tmp_path):
-    for name in ("iteration-000010.pt", "iteration-000011.pt"):
-        (tmp_path / name).touch()
-    save_checkpoint(tmp_path, 6, state(6.0))
-    assert_newest(tmp_path, 6.0)
-
-
-def test_after_a_step_back_those_of_later_iterations_go_first(tmp_path):
-    """The later one was given up, as its file was damaged: it must not outlive the good one."""
-    for iteration in (1000, 2000):
-        save_checkpoint(tmp_path, iteration, state(iteration))
-    (tmp_path / "latest").write_text("iteration-001000.pt")
-    save_checkpoint(tmp_path, 1500, state(1500))
-    assert {file.name for file in tmp_path.glob("*.pt")} == {"iteration-001000.pt", "iteration-001500.pt"}
 
 
 def test_no_checkpoint_is_none(tmp_path):
     assert latest_checkpoint(tmp_path) is None and latest_checkpoint(tmp_path / "absent") is None
-
-
-def test_without_latest_the_newest_is_taken(tmp_path):
-    for iteration in (5, 10):
-        save_checkpoint(tmp_path, iteration, state(iteration))
-    (tmp_path / "latest").unlink()
-    assert latest_checkpoint(tmp_path).name == "iteration-000010.pt"
 
 
 class DiskFull:
@@ -112,7 +89,7 @@ class Killed(BaseException):
     """Stands for a kill: nothing after it runs, not even the removal of temporary files."""
 
 
-@pytest.mark.parametrize("call", range(1, 9))
+@pytest.mark.parametrize("call", range(1, 6))
 def test_a_kill_between_any_two_steps_keeps_a_whole_checkpoint(tmp_path, monkeypatch, call):
     save_checkpoint(tmp_path, 1, state(1.0))
     save_checkpoint(tmp_path, 2, state(2.0))
@@ -138,7 +115,7 @@ def test_a_kill_between_any_two_steps_keeps_a_whole_checkpoint(tmp_path, monkeyp
     except Killed:
         survived = False
     monkeypatch.undo()
-    assert survived == (call == 8)
+    assert survived == (call == 5)
     newest = latest_checkpoint(tmp_path)
     assert newest.name in ("iteration-000002.pt", "iteration-000003.pt")
     assert_newest(tmp_path, int(newest.stem[-1]))
@@ -146,9 +123,8 @@ def test_a_kill_between_any_two_steps_keeps_a_whole_checkpoint(tmp_path, monkeyp
     assert_newest(tmp_path, 4.0)
 
 
-@pytest.mark.parametrize(("number", "room"), [(1, 0), (1, 2000), (2, 0), (2, 5)])
+@pytest.mark.parametrize(("number", "room"), [(1, 0), (1, 2000)])
 def test_a_kill_in_the_middle_of_a_write_keeps_a_whole_checkpoint(tmp_path, monkeypatch, number, room):
-    """The checkpoint is the first file that is written, the pointer the second."""
     save_checkpoint(tmp_path, 1, state(1.0))
     opened = []
 
@@ -186,21 +162,7 @@ def test_a_torn_temporary_file_is_no_checkpoint(tmp_path):
     files.partial_path(tmp_path / "iteration-000002.pt").write_bytes(path.read_bytes()[:100])
     assert latest_checkpoint(tmp_path) == path
     save_checkpoint(tmp_path, 3, state(3.0))
-    assert {file.name for file in tmp_path.iterdir()} == {path.name, "iteration-000003.pt", "latest"}
-
-
-@pytest.mark.parametrize("name", ["../iteration-000001.pt", "/etc/passwd", "iteration-000009.pt", "", "latest"])
-def test_a_pointer_elsewhere_is_refused(tmp_path, name):
-    save_checkpoint(tmp_path, 1, state())
-    (tmp_path / "latest").write_text(name)
-    (tmp_path / "iteration-000008.pt").touch()
-    remedy = r"; write iteration-000008.pt into '.*latest' to use that one, or train anew"
-    with pytest.raises(InputError, match=f"names no checkpoint.*{remedy}"):
-        latest_checkpoint(tmp_path)
-    for file in tmp_path.glob("*.pt"):
-        file.unlink()
-    with pytest.raises(InputError, match=r"names no checkpoint of its folder: '.*'; train anew with another --out"):
-        latest_checkpoint(tmp_path)
+    assert {file.name for file in tmp_path.iterdir()} == {path.name, "iteration-000003.pt"}
 
 
 class Exploit:
@@ -243,7 +205,7 @@ def test_a_truncated_file_is_refused(tmp_path, keep):
     with pytest.raises(InputError, match=r"cannot be used: .*; train anew with another --out"):
         load_checkpoint(path)
     (tmp_path / "iteration-000000.pt").touch()
-    with pytest.raises(InputError, match=r"cannot be used: .*; write iteration-000000\.pt into '.*latest' to"):
+    with pytest.raises(InputError, match=r"cannot be used: .*; remove it to go on from iteration-000000\.pt, or"):
         load_checkpoint(path)
 
 
@@ -262,27 +224,6 @@ def test_only_plain_values_are_saved(tmp_path, value):
     with pytest.raises(TypeError, match=r"state\.x"):
         save_checkpoint(tmp_path, 1, {"x": value})
     assert not list(tmp_path.iterdir())
-
-
-def test_an_atomic_write_leaves_the_old_text_on_failure(tmp_path):
-    target = tmp_path / "text"
-    files.write_text_atomically(target, "old")
-
-    def fail(file):
-        file.write(b"new")
-        raise ValueError
-
-    with pytest.raises(ValueError):
-        files.write_atomically(target, fail)
-    assert target.read_text() == "old" and os.listdir(tmp_path) == ["text"]
-
-
-def test_a_model_on_a_full_disk_is_refused_for_what_it_is(tmp_path):
-    model = gaussians_from_points(torch.rand(500, 3), torch.zeros(500, 3, dtype=torch.uint8), 0, 1.0)
-    files.partial_path(tmp_path / "model.ply").symlink_to("/dev/full")
-    with pytest.raises(InputError, match=r"model\.ply: No space left on device; .*make room"):
-        ply.save_ply(model, tmp_path / "model.ply")
-    assert not os.listdir(tmp_path)
 
 
 def test_processes_that_write_the_same_file_do_not_meet(tmp_path, monkeypatch):
@@ -329,19 +270,6 @@ def test_a_large_file_is_brought_to_the_disk_while_it_is_written(tmp_path, monke
     assert target.read_bytes() == b"new" and os.listdir(tmp_path) == ["model"]
 
 
-@pytest.mark.parametrize("place", ["text", "absent/text", "folder"])
-def test_a_failed_write_names_its_file(tmp_path, place):
-    """A disk that is full, a folder that is gone, and a folder in the place of the file."""
-    target = tmp_path / place
-    (tmp_path / "folder").mkdir()
-    if place == "text":
-        files.partial_path(target).symlink_to("/dev/full")
-    with pytest.raises(OSError) as failed:
-        files.write_text_atomically(target, "new")
-    assert failed.value.filename == str(target) and str(target) in str(failed.value)
-    assert ".part" not in str(failed.value)
-
-
 @pytest.mark.parametrize("cut", ['{"iteration": 1', '{"iteration": 1\n', "\0\0\0\n", "\n"])
 def test_a_last_line_that_was_cut_is_left_out_of_a_history(tmp_path, cut):
     path, entry = tmp_path / "history.jsonl", Evaluation(0, 0.0, 9.0, 0.1, 0.1, 5, 0)
@@ -352,13 +280,6 @@ def test_a_last_line_that_was_cut_is_left_out_of_a_history(tmp_path, cut):
     path.write_text(f"{cut.rstrip()}\n{whole}")
     with pytest.raises(InputError, match=r"history\.jsonl' line 1 is not an evaluation: take that line out"):
         read_history(path)
-
-
-def test_a_history_on_a_full_disk_is_named(tmp_path):
-    (tmp_path / "history.jsonl").symlink_to("/dev/full")
-    with pytest.raises(OSError) as failed:
-        append_evaluation(tmp_path / "history.jsonl", Evaluation(0, 0.0, 9.0, 0.1, 0.1, 5, 0))
-    assert failed.value.filename == str(tmp_path / "history.jsonl")
 
 
 def test_a_model_is_written_as_atomically_as_a_checkpoint(tmp_path, monkeypatch):

@@ -1,10 +1,8 @@
 """Training in memory, from Python."""
 
-import pytest
 import torch
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.train.run import fit
 
 SHORT = ("train.iterations=2", "train.refine_until=1", "train.device=cpu")
@@ -16,8 +14,3 @@ def test_a_folder_is_read_as_the_section_scene_says(capture):
     for name, value in models[2].items():
         assert all(torch.equal(getattr(model, name), value) for model in models[:2])
     assert not torch.equal(whole.sh0, models[0].sh0)
-
-
-def test_a_folder_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(InputError, match="absent"):
-        fit(tmp_path / "absent", *SHORT)

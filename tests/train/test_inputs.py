@@ -22,38 +22,17 @@ def unread(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "words"),
+    ("override", "words"),
     [
-        (["budget.max_memory=2GiB"], "--max-memory limits the memory of a GPU, and this run would be on a CPU: leave"),
-        (["train.backdrop=true", "density.max_gaussians=3000"], "no room beside the 3000 of the backdrop: allow more"),
-        (["train.init=absent.ply"], "no such model 'absent.ply'"),
-        (["train.init=spoilt.ply"], "spoilt.ply is not a .ply file"),
-        (["train.init=three.ply", "density.max_gaussians=2"], "has 3 Gaussians, more than density.max_gaussians 2"),
-        (["report.lpips_weights=absent.pth"], "no such file 'absent.pth'"),
+        ("budget.max_memory=2GiB", "--max-memory limits the memory of a GPU, and this run would be on a CPU: leave"),
+        ("train.init=absent.ply", "no such model 'absent.ply'"),
     ],
 )
-def test_what_needs_no_photo(capture, tmp_path, monkeypatch, overrides, words):
-    monkeypatch.chdir(tmp_path)
-    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
-    names += [f"rot_{axis}" for axis in range(4)]
-    header = [
-        "ply",
-        "format ascii 1.0",
-        "element vertex 3",
-        *(f"property float {name}" for name in names),
-        "end_header",
-    ]
-    rows = [" ".join(["0"] * 10 + ["1", "0", "0", "0"])] * 3
-    Path("three.ply").write_text("\n".join([*header, *rows, ""]))
-    Path("spoilt.ply").write_text("no")
+@pytest.mark.parametrize("begin", [run.plan_run, run.train])
+def test_what_needs_no_photo(capture, tmp_path, begin, override, words):
     with pytest.raises(InputError, match=words):
-        run.train(tiny_config(capture, *overrides), tmp_path / "run")
+        begin(tiny_config(capture, override), *([tmp_path / "run"] if begin is run.train else []))
     assert not (tmp_path / "run").exists()
-
-
-def test_a_plan_is_refused_as_the_run(capture):
-    with pytest.raises(InputError, match="--max-memory limits the memory of a GPU"):
-        run.plan_run(tiny_config(capture, "budget.max_memory=2GiB"))
 
 
 def test_a_factor_for_which_photos_are_too_small_is_refused_before_they_are_reconstructed(tmp_path, monkeypatch):

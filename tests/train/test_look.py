@@ -51,13 +51,6 @@ def test_a_part_of_the_sequence_that_is_missing_is_told_as_far_as_such_parts_are
     assert lengths[[0, -1]].min() > 0.5 * wanted.mean() and lengths[56:72].max() < 0.1 * wanted.mean()
 
 
-def test_the_order_of_photos_in_memory_does_not_matter():
-    wave, mixed = of(torch.sin(torch.arange(40) / 6)), torch.randperm(35, generator=torch.Generator().manual_seed(1))
-    shuffled = [TRAINED[row] for row in mixed]
-    told = interpolated_exposures(wave[rows(shuffled)], shuffled, TEST)
-    torch.testing.assert_close(told, interpolated_exposures(wave[rows(TRAINED)], TRAINED, TEST), rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("trained", [["a/1.jpg"], ["a/1.jpg", "a/2.jpg"], ["1.jpg", "2.jpg", "3.jpg"]])
 def test_without_neighbours_or_differences_it_is_the_identity(trained):
     offsets = torch.zeros(len(trained), 3, 4) if len(trained) == 3 else torch.ones(len(trained), 3, 4)

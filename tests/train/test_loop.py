@@ -8,7 +8,7 @@ from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin.config.sections import TrainConfig
 from turbogs_plugin.train.loop import Listener, TrainingLoop
-from turbogs_plugin.train.pace import IterationPace
+from turbogs_plugin.train.pace import Pace
 
 
 class CountingTrainer:
@@ -129,6 +129,6 @@ def test_only_training_is_on_the_clock(monkeypatch):
     step, initialise = trainer.step, trainer.initialise_maps
     trainer.step = lambda: (step(), clock.passes(1.0))
     trainer.initialise_maps = lambda: (initialise(), clock.passes(1.0))
-    loop = TrainingLoop(trainer, IterationPace(trainer.config.train), [Slow()], seconds=2.0)
+    loop = TrainingLoop(trainer, Pace(trainer.config.train), [Slow()], seconds=2.0)
     loop.run()
     assert loop.clock.seconds == 2.0 + 1.0 + 6.0

@@ -1,6 +1,5 @@
 """The mean of the last iterations, which becomes the model: what counts, restarts, resumes."""
 
-import copy
 import re
 from pathlib import Path
 
@@ -9,10 +8,9 @@ import torch
 from helpers.framework_runs import assert_identical, stop_after, tiny_capture, tiny_config
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.parameter_mean import AVERAGE_EVERY, ParameterMean
-from turbogs_plugin.train.run import fit, resume, train
+from turbogs_plugin.train.run import resume, train
 from turbogs_plugin.train.session import RunSession
 from turbogs_plugin.train.trainer import Trainer
 
@@ -55,7 +53,7 @@ def averaged(capture) -> tuple[Trainer, Kept]:
 
 @pytest.fixture(scope="module")
 def whole(capture, tmp_path_factory) -> RunSession:
-    """The same training as a run."""
+    """A run with the settings of `averaged`."""
     return train(tiny_config(capture, *AVERAGED), tmp_path_factory.mktemp("runs") / "whole")
 
 
@@ -79,7 +77,7 @@ def test_it_is_the_mean_of_what_was_added():
 
 
 def test_it_goes_into_another_trainers_parameters():
-    """Of gsplat's splats: a dictionary of parameters, whose rows its strategies change."""
+    """gsplat has a dictionary of parameters, whose rows its strategies change."""
     splats = torch.nn.ParameterDict(tensors(1.0))
     mean = ParameterMean(0.5, splats)
     mean.add(splats)
@@ -95,7 +93,7 @@ def test_it_goes_into_another_trainers_parameters():
     mean.overwrite(splats)  # none is there
     torch.testing.assert_close(dict(splats), tensors(6.0, rows=3))
     mean.add(splats)
-    with pytest.raises(ValueError, match=r"the mean of means has shape \(3, 3\), not \(7, 3\): restart it"):
+    with pytest.raises(RuntimeError, match="size"):
         mean.overwrite(tensors(0.0, rows=7))
 
 
@@ -119,26 +117,6 @@ def test_the_last_share_of_a_run_counts_and_its_end_always_does():
     mean = ParameterMean(0.1, tensors(0.0))
     assert [i for i in range(1, 104) if mean.due(i, 103)] == [96, 100, 103]
     assert mean.due(3, 3) and ParameterMean(1.0, tensors(0.0)).due(AVERAGE_EVERY, 1000)
-
-
-def test_a_run_that_became_longer_begins_its_mean_anew():
-    mean = ParameterMean(0.1, tensors(0.0))
-    assert mean.due(96, 100)
-    mean.add(tensors(1.0))
-    assert not mean.due(97, 200) and mean.count == 0
-
-
-def test_iterations_that_are_made_again_count_once():
-    mean, wanted = ParameterMean(0.5, tensors(0.0)), ParameterMean(0.5, tensors(0.0))
-    for value in (1.0, 3.0, 3.0, 3.0):  # iterations 8, 12, 16, 20; from the second on nothing changed
-        mean.add(tensors(value))
-    mean.take_back(tensors(3.0), 13, 20, 20)
-    for value in (1.0, 3.0):
-        wanted.add(tensors(value))
-    assert mean.count == wanted.count == 2
-    torch.testing.assert_close(dict(mean.tensors), dict(wanted.tensors))
-    mean.take_back(tensors(3.0), 1, 20, 20)
-    assert mean.count == 0
 
 
 def test_thousands_of_equal_models_have_themselves_as_mean():
@@ -199,23 +177,3 @@ def test_a_resume_within_the_mean_gives_the_same_bits(capture, whole, tmp_path, 
     assert_identical(whole.trainer.state_dict(), resumed.trainer.state_dict())
     again = resume(tmp_path / "stopped")  # a run at its end stays as it is
     assert_identical(whole.trainer.state_dict(), again.trainer.state_dict())
-
-
-def test_a_mean_of_another_model_is_refused(averaged, capture):
-    trainer = Trainer(tiny_config(capture, *AVERAGED).without_plan(), load_scene(capture), CPU)
-    state = copy.deepcopy(averaged[0].state_dict())
-    trainer.load_state_dict(state)
-    state["parameter_mean"] = {"count": 2, "tensors": {name: value[1:] for name, value in trainer.learnt().items()}}
-    with pytest.raises(ValueError, match=r"the mean of means over 2 iterations has shape \(\d+, 3\)"):
-        trainer.load_state_dict(state)
-
-
-def test_a_model_of_one_iteration_is_that_iterations(capture):
-    gaussians = fit(load_scene(capture), "train.iterations=1", "train.refine_until=1", "train.device=cpu")
-    assert all(bool(value.isfinite().all()) for _, value in gaussians.items())
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.5])
-def test_a_share_is_within_0_and_1(capture, share):
-    with pytest.raises(InputError, match="average_last"):
-        tiny_config(capture, f"train.average_last={share}")

@@ -1,9 +1,10 @@
-"""FLIP: the library's input, where it is computed, and that nothing needs it."""
+"""FLIP and LPIPS: what the libraries are given, where they are computed, and why they are not."""
 
 import importlib.util
 import math
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,16 +12,16 @@ from helpers.framework_runs import TINY, tiny_capture, tiny_config
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.doctor import diagnosis
 from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.study.cell import train_cell
 from turbogs_plugin.train import perceptual, run
-from turbogs_plugin.train.perceptual import load_flip
+from turbogs_plugin.train.perceptual import load_flip, load_lpips
 from turbogs_plugin.train.saved_model import load_model
 
 pytestmark = pytest.mark.usefixtures("plotted")
 
+CPU = torch.device("cpu")
 STAND_IN = """
 import numpy
 
@@ -51,11 +52,6 @@ def library(tmp_path, monkeypatch):
     sys.modules.pop("flip_evaluator", None)
 
 
-@pytest.fixture
-def absent(monkeypatch):
-    monkeypatch.setattr(perceptual, "FLIP_PACKAGE", "no_such_package_as_this")
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("flip")
@@ -82,30 +78,21 @@ def test_what_is_not_finite_has_no_flip(library, broken):
 
 def test_eval_prints_it_and_says_why_not(finished, library, monkeypatch):
     text = evaluate_run(finished, "cpu")
-    views = len(load_scene(load_model(finished, torch.device("cpu")).config.scene.path).test)
+    views = len(load_scene(load_model(finished, CPU).config.scene.path).test)
     assert "| FLIP |" in text and text.count("| 0.2500 |") == views + 1 and len(library.calls) == views
     monkeypatch.setattr(perceptual, "FLIP_PACKAGE", "no_such_package_as_this")
     text = evaluate_run(finished, "cpu")
     assert "| FLIP |" not in text and "FLIP was not computed: flip-evaluator is not installed; pip install" in text
 
 
-def test_doctor_names_it_where_it_is_absent(absent):
-    assert "FLIP is not computed: flip-evaluator" in diagnosis()
-
-
-def test_a_run_does_not_wait_for_it(library, tmp_path):
-    run.train(tiny_config(tiny_capture(tmp_path)), tmp_path / "run")
-    assert not library.calls
-
-
 def test_a_cell_has_it_once_off_its_clock(library, tmp_path, monkeypatch):
     scene = load_scene(tiny_capture(tmp_path))
     config = load_config("turbogs", TINY)
-    result = train_cell("x", config, scene, torch.device("cpu"), provenance("cpu"), loading=1000.0)
+    result = train_cell("x", config, scene, CPU, provenance("cpu"), loading=1000.0)
     assert result.final["flip"] == 0.25 and len(library.calls) == len(scene.test)
     assert 1000.0 + result.final["seconds"] < result.final["cell_seconds"] < 2000.0
     monkeypatch.setattr(perceptual, "FLIP_PACKAGE", "no_such_package_as_this")
-    result = train_cell("x", config, scene, torch.device("cpu"), provenance("cpu"))
+    result = train_cell("x", config, scene, CPU, provenance("cpu"))
     assert not {"flip", "cell_seconds"} & set(result.final), "a load that was not timed is not 0"
 
 
@@ -119,3 +106,26 @@ def test_the_library_itself():
     assert values[0] == 0.0 and values == sorted(values) and values[-1] < 1.0
     black, white = torch.zeros(30, 30, 3), torch.ones(30, 30, 3)
     assert perceptual.flip(white, black) == pytest.approx(0.967, abs=0.002)  # FLIP 1.7's at 67 pixels a degree
+
+
+def test_lpips_takes_the_weights_of_torchs_cache_and_says_what_is_missing(tmp_path, monkeypatch):
+    class Network(torch.nn.Module):
+        def __init__(self, **_) -> None:
+            super().__init__()
+
+        def forward(self, image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
+            assert image.shape == photo.shape == (1, 3, 4, 5)
+            return (image - photo).abs().mean()
+
+    module = SimpleNamespace(LearnedPerceptualImagePatchSimilarity=Network)
+    monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", module)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(perceptual, "LPIPS_PACKAGES", ("torch", "no_such_package"))
+    assert load_lpips(CPU)[1].startswith("it needs no_such_package: pip install no_such_package torch==")
+    monkeypatch.setattr(perceptual, "LPIPS_PACKAGES", ())
+    function, reason = load_lpips(CPU)
+    assert function is None and f"put torchvision's file at {tmp_path}" in reason
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints/vgg16-397923af.pth").touch()
+    function, reason = load_lpips(CPU)
+    assert function(torch.ones(4, 5, 3), torch.zeros(4, 5, 3)) == 1.0 and reason == ""

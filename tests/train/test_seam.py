@@ -11,7 +11,6 @@ from helpers.losing_engine import LosingEngine
 
 from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.engine.reference.update import apply_update
-from turbogs_plugin.engine.render_pass import RenderOptions
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
@@ -91,7 +90,7 @@ def test_an_optimizer_of_its_own_code_trains_as_its_rule_would(capture, make):
 
 @pytest.mark.parametrize("calls", [0, 2])
 def test_statistics_are_written_once_whatever_the_optimizer_does(capture, calls):
-    """It may leave an iteration out or make two steps of it: the density window gets each backward pass once."""
+    """Statistics of density control get each backward pass once, whether an optimizer makes no step of it or two."""
     usual, odd = make_trainer(capture), make_trainer(capture)
     odd.optimizer = OwnCode(MomentLMOptimizer())
     odd.optimizer.calls = calls
@@ -119,16 +118,6 @@ def test_the_engine_gets_rule_moments_and_statistics(capture, monkeypatch):
     assert gaussians is trainer.gaussians and torch.equal(gaussians.means, before)
     apply_update(rule, gaussians, screen.parameter_gradients(rule.per_view, stats), moments)
     assert not torch.equal(gaussians.means, before)
-
-
-def test_statistics_need_a_pass_that_sums_them_up(capture):
-    trainer = make_trainer(capture)
-    samples = trainer.pixel_sampler.sample(trainer.maps, (0, 1), 0.2, trainer.now)
-    cameras, options = trainer.views.cameras.select((0, 1)), RenderOptions(0, trainer.config.raster)
-    rendered = trainer.engine.render(trainer.gaussians, cameras, samples, options)
-    screen = rendered.backward(torch.ones_like(rendered.colors))
-    with pytest.raises(ValueError, match="with_statistics"):
-        screen.parameter_gradients(rows=True, stats=trainer.density.stats)
 
 
 class Restless:

@@ -13,9 +13,8 @@ from typing import Any
 
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.train.clock import WallRecord
-from turbogs_plugin.train.run import DEVICE
+from turbogs_plugin.train.inputs import DEVICE
 from turbogs_plugin.train.run_files import RunFolder
-from turbogs_plugin.train.session import CHECKPOINT
 
 REST = "start of the process, and its end"
 """What a process cannot measure of itself."""
@@ -31,7 +30,7 @@ class WallRun:
     Args:
         seconds: from its start to its end, seen from outside.
         train_seconds: training, as the run's history has it.
-        model_seconds: from the start of its process until the model was written.
+        model_seconds: from the start of its command until the model was written.
         parts: what -> seconds that went into it; together they are `seconds`.
     """
 
@@ -42,8 +41,8 @@ class WallRun:
 
     @property
     def ready_seconds(self) -> float:
-        """From the start of the process until model, report and pictures are there; the checkpoint may come later."""
-        return self.seconds - self.parts.get(CHECKPOINT, 0.0) - self.parts.get(REST, 0.0)
+        """From the start of the command until model, checkpoint, report and pictures are there."""
+        return self.seconds - self.parts.get(REST, 0.0)
 
     @property
     def beside_training(self) -> float:
@@ -70,7 +69,7 @@ def time_command(arguments: Sequence[str]) -> WallRun:
         ended = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         seconds = time.perf_counter() - started
         record = WallRecord.read(RunFolder(out).wall)
-    if ended.returncode or record is None:
+    if ended.returncode or record is None or record.wall_seconds is None:
         last = (ended.stderr.strip().splitlines() or ["it said nothing"])[-1].removeprefix("turbogs: error: ")
         raise InputError(last) if ended.returncode == 2 else TrainingStopped(f"turbogs train: {last}")
     parts = record.parts | {REST: seconds - sum(record.parts.values())}

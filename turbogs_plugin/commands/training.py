@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 
 from turbogs_plugin.commands.options import LOCAL, NO_OPTIONS, PORT, Count, Flat, Overrides, Scene, is_change
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.train.clock import WallClock, process_age
+from turbogs_plugin.train.clock import WallClock
 
 if TYPE_CHECKING:
     from turbogs_plugin.train.session import RunSession
@@ -51,7 +51,7 @@ def train(
         gpus: number of this machine's GPUs that train one model, a process each; torchrun does the same on several
             machines. docs/scaling.md says what they gain.
     """
-    clock = WallClock(process_age())
+    clock = WallClock()
     if viewer is None and viewer_host != LOCAL:
         raise InputError("--viewer-host says where a viewer listens: give --viewer, too")
     if resume is not None:
@@ -72,8 +72,8 @@ def train(
     from turbogs_plugin.train import run
 
     settings = options.settings(scene, overrides) if resume is None else run.RunFolder(resume).read_config()
-    if resume and viewer is None and (finished := run.RunFolder(resume).finished_text(report)):
-        print(finished)
+    if resume and viewer is None and run.RunFolder(resume).finished(report):
+        print(f"{resume} is finished: its model is {run.RunFolder(resume).model}")
         return 0
     if gpus is not None and gpus > 1 and not launched():
         if out is not None:

@@ -178,11 +178,6 @@ class TrainConfig:
         """Whether `init` names a model's file."""
         return self.init not in ("points", "random")
 
-    def evaluation_iterations(self) -> set[int]:
-        """Counts of finished iterations after which to evaluate."""
-        total = self.written_iterations
-        return {0, total, *(max(1, round(part * total)) for part in self.evaluate_at)}
-
     def sh_degree_at(self, iteration: int) -> int:
         """Degree of the bands in use at an iteration."""
         return self.sh_degree if self.starts_from_model else min(self.sh_degree, iteration // self.sh_interval)
@@ -207,12 +202,10 @@ class ReportConfig:
     """The report.
 
     Args:
-        lpips_weights: local file with the backbone's weights (torchvision's VGG16), or null: LPIPS is not computed.
         tensorboard: also write the history and pictures of test views for TensorBoard, into the run's folder at each
             evaluation; needs the extra ``tensorboard``.
     """
 
-    lpips_weights: str | None = None
     tensorboard: bool = False
 
 

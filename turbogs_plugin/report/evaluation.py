@@ -27,7 +27,7 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
     model, scene = open_saved(path, device_name, given)
     views, look = views_of(model, scene, "test")
     views = place_views(views, model.gaussians.device, model.config.train.photos_place)
-    lpips, reason = load_lpips(model.config.report.lpips_weights, model.gaussians.device)
+    lpips, reason = load_lpips(model.gaussians.device)
     flip, no_flip = load_flip()
     metrics = evaluate(model.gaussians, views, look, lpips, flip, aligned=True, refined=True)
     note = f"\nLPIPS was not computed: {reason}" if reason else ""

@@ -11,7 +11,7 @@ from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.plan import Plan
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip
 from turbogs_plugin.report.provenance import hardware, software
-from turbogs_plugin.report.tables import ERRORS, error_columns, errors, history_rows, number, table, views_table
+from turbogs_plugin.report.tables import ERRORS, error_columns, errors, history_rows, table, views_table
 from turbogs_plugin.train.metrics import Metrics, evaluate, render_view
 from turbogs_plugin.train.perceptual import load_lpips
 from turbogs_plugin.train.session import RunSession
@@ -23,9 +23,9 @@ def write_report(run: RunSession) -> Path:
     Returns:
         The page.
     """
-    trainer, config = run.trainer, run.trainer.config
+    trainer = run.trainer
     look = trainer.look(run.test.names)
-    lpips, lpips_reason = load_lpips(config.report.lpips_weights, trainer.device)
+    lpips, lpips_reason = load_lpips(trainer.device)
     metrics = None if lpips else run.evaluations.metrics_at(trainer.iteration)
     if metrics is None:
         aligned = trainer.exposures is not None
@@ -40,7 +40,6 @@ def write_report(run: RunSession) -> Path:
         save_image(pictures / f"test-{view_id:03d}.jpg", strip(photo, image, run.test.mask(view_id)))
     _plot(run, pictures)
     run.clock.mark("pictures and plots")
-    run.finish_model()  # the page says how long it took until it was there
     write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, strips))
     run.clock.mark("report")
     return run.folder.report
@@ -66,8 +65,8 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
     last = run.history[-1]
     config = run.trainer.config
     columns = error_columns(metrics)
-    masked = "whole_l1" in columns
-    unmasked = ", without their masked pixels where nothing else is said" if masked else ""
+    masked = run.test.masks is not None
+    unmasked = ", without their masked pixels" if masked else ""
     on = ""
     if run.test.photos.transparent:
         red, green, blue = (round(255 * value) for value in run.trainer.background.evaluated)
@@ -85,7 +84,8 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
         )
     grey = "; masked pixels of photo and error are grey" if masked else ""
     heads = (*columns.values(), "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB")
-    seconds = f"{last.train_seconds:.1f}", number(run.wall.wall_seconds, 1, "not recorded")
+    wall = run.wall.wall_seconds
+    seconds = f"{last.train_seconds:.1f}", "not recorded" if wall is None else f"{wall:.1f}"
     rows = history_rows(run.history)
     *_, memory = rows[-1]
     cells = (*errors(metrics.mean, columns), *seconds, str(last.num_gaussians), f"{metrics.fps:.1f}", memory)
@@ -106,7 +106,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
 {result}
 {lpips}
 Means over the test views{unmasked}. Training time is that of iterations and of the initial error maps; loading,
-evaluation, checkpoints and this report are not in it. Wall time is from the start of the process until the model was
+evaluation, checkpoints and this report are not in it. Wall time is from the start of the command until the model was
 written. FPS counts test views rendered one after the other. FLIP: `turbogs eval {folder}`.{on}
 
 `turbogs export {folder} --format html` writes a page with the model to turn in a browser, {exported}.

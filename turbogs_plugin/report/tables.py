@@ -12,7 +12,6 @@ ERRORS = {"psnr": "PSNR in dB", "ssim": "SSIM", "l1": "mean absolute error"}
 """Measure -> head of its column, in every table of errors. Masked pixels do not count in them."""
 
 FURTHER_KINDS = {
-    "whole": "with masked pixels",
     "own": "of the model's own colours",
     "aligned": "after colour alignment",
     "refined": "by refined test cameras",

@@ -61,7 +61,7 @@ def train_cell(
         InputError: a budget is too small.
         TrainingStopped: the model is lost.
     """
-    lpips, lpips_reason = load_lpips(config.report.lpips_weights, device)
+    lpips, lpips_reason = load_lpips(device)
     flip, _ = load_flip()
     clock = WallClock()
     planned = make_plan(config, scene, device).apply(config)

@@ -20,8 +20,6 @@ class FurtherErrors:
     """Errors beside the plain ones, which only some captures have: NaN where they were not asked for or not computed.
 
     Args:
-        whole_psnr, whole_ssim, whole_l1: with masked pixels, which have no part in the plain ones; NaN where no test
-            view has a mask.
         own_psnr, own_ssim, own_l1: of the model's own colours, in runs that learn exposures; the plain ones there are
             of test views with the exposures of their neighbours (`interpolated_exposures`).
         aligned_psnr, aligned_ssim, aligned_l1: of the model's own colours after a colour alignment (`align_colors`), in
@@ -30,9 +28,6 @@ class FurtherErrors:
             end of runs whose capture says which photos show a point.
     """
 
-    whole_psnr: float = math.nan
-    whole_ssim: float = math.nan
-    whole_l1: float = math.nan
     own_psnr: float = math.nan
     own_ssim: float = math.nan
     own_l1: float = math.nan
@@ -100,7 +95,7 @@ def read_history(path: Path) -> list[Evaluation]:
     evaluations = []
     lines = text[: text.rfind("\n") + 1].splitlines()
     for number, line in enumerate(lines, start=1):
-        if number == len(lines) and not line.rstrip("\0").endswith("}"):
+        if number == len(lines) and not line.endswith("}"):
             break
         try:
             found = ((name, value) for name, value in json.loads(line).items() if name in names)

@@ -13,7 +13,7 @@ from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gau
 from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.plan.photo_gains import compare_exposures
 from turbogs_plugin.scene import PosedImages, Scene
-from turbogs_plugin.train.given_model import load_given
+from turbogs_plugin.train.saved_model import load_given
 from turbogs_plugin.types import Gaussians
 
 COLOR_STRIDE = 97

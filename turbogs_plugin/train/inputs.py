@@ -1,10 +1,10 @@
-"""Device and capture of a configuration, and what can be refused before a photo is decoded."""
+"""Device and capture of a configuration."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
@@ -15,13 +15,12 @@ from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.initial import BACKDROP_COUNT
-from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
-from turbogs_plugin.plan.memory import require_gpu_memory
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.given_model import read_given
-from turbogs_plugin.train.progress import LoadingProgress
+from turbogs_plugin.train.clock import WallClock
 from turbogs_plugin.train.run_files import RunFolder
+
+PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
+"""Parts of the wall time in which photos are decoded, and the device is then waited for."""
 
 
 def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs doctor'") -> torch.device:
@@ -32,36 +31,53 @@ def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs d
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def require_possible(config: Config) -> None:
-    """Refuse what can be refused before the cameras of photos are found, or any photo is decoded.
-
-    Raises:
-        InputError: a device or a limit of its memory that this machine does not have; a model to start from that cannot
-            be read; more Gaussians to start from than are allowed.
-    """
-    train, cap = config.train, cap_of(config)
-    if train.device == "cuda":
-        resolve_device("cuda")
-    if config.budget.max_memory:
-        require_gpu_memory(resolve_device(train.device))
-    backdrop = BACKDROP_COUNT if train.backdrop is True else 0
-    if train.starts_from_model:
-        require_room(train.init, len(read_given(train.init)), cap, backdrop)
-    else:
-        chosen_points(1, cap, backdrop)
+def show_loading(loaded: int, total: int) -> None:
+    """Count decoded photos in a terminal line, which goes when all are there; nothing where stderr is no terminal."""
+    if sys.stderr.isatty():
+        text = f"\r{loaded} of {total} photos decoded" if loaded < total else "\r\033[K"
+        print(text, end="", file=sys.stderr, flush=True)
 
 
-@contextmanager
-def starting(resolve: Callable[[], torch.device], ranks: Ranks = ONE) -> Iterator[Future[torch.device]]:
-    """While entered, a thread starts a device and loads its kernels: CUDA takes a second or more until it answers.
+def open_scene(config: Config, folder: RunFolder | None = None, ranks: Ranks = ONE) -> Scene:
+    """The capture of a configuration. On a terminal, its photos are counted while they are decoded.
 
     Args:
-        resolve: says which device; what it raises is raised by the future.
-        ranks: the processes that train together; each calls this. Where one ends before, the others wait until their
-            launcher ends them.
+        folder: of the run with this configuration; None if the user names the capture.
+        ranks: the processes that train together; each calls this. The first one refines cameras for all: machines
+            differ in their last digits, and replicas may not.
 
-    Yields:
-        The device, started.
+    Raises:
+        InputError: there is no usable capture.
+    """
+    settings = config.scene
+    if folder is not None and not Path(settings.path).exists():
+        raise InputError(
+            f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
+            f"in {folder.config}"
+        )
+    progress = show_loading if ranks.first else None
+    scene, cameras = load_and_find(settings.path, settings.factor, settings.test_every, progress, find=ranks.first)
+    return with_cameras(scene, ranks.agree(cameras), config.train.refine_cameras)
+
+
+def open_started(
+    config: Config,
+    resolve: Callable[[], torch.device],
+    clock: WallClock,
+    folder: RunFolder | None = None,
+    ranks: Ranks = ONE,
+) -> tuple[Scene, torch.device]:
+    """The capture, and the device with its kernels loaded: a thread starts it, in a second or more, while photos are
+    decoded.
+
+    Args:
+        resolve: says which device; what it raises is raised here.
+        clock: of the wall, on which `PHOTOS` and `DEVICE` are marked.
+        folder, ranks: as for `open_scene`. Where one process ends before, the others wait until their launcher ends
+            them.
+
+    Raises:
+        InputError: there is no usable capture, or no such device.
     """
 
     def start() -> torch.device:
@@ -73,41 +89,9 @@ def starting(resolve: Callable[[], torch.device], ranks: Ranks = ONE) -> Iterato
         return device
 
     with ThreadPoolExecutor(1) as pool:
-        yield pool.submit(start)
-
-
-def open_scene(config: Config, folder: RunFolder | None = None, ranks: Ranks = ONE) -> Scene:
-    """The capture of a configuration.
-
-    Args:
-        folder: of the run with this configuration; None if the user names the capture.
-        ranks: the processes that train together; each calls this.
-
-    Raises:
-        InputError: there is no usable capture.
-    """
-    settings = config.scene
-    if folder is not None and not Path(settings.path).exists():
-        raise InputError(
-            f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
-            f"in {folder.config}"
-        )
-    return read_scene(settings.path, config, LoadingProgress() if ranks.first else None, ranks)
-
-
-def read_scene(
-    path: str | Path, config: Config, progress: Callable[[int, int], None] | None = None, ranks: Ranks = ONE
-) -> Scene:
-    """A capture as a configuration trains on it.
-
-    Args:
-        progress: as of `load_scene`.
-        ranks: the processes that train together; each calls this. The first one refines cameras for all: machines
-            differ in their last digits, and replicas may not.
-
-    Raises:
-        InputError: as `load_scene`.
-    """
-    settings = config.scene
-    scene, cameras = load_and_find(path, settings.factor, settings.test_every, progress, find=ranks.first)
-    return with_cameras(scene, ranks.agree(cameras), config.train.refine_cameras)
+        started = pool.submit(start)
+        scene = open_scene(config, folder, ranks)
+        clock.mark(PHOTOS)
+        device = started.result()
+    clock.mark(DEVICE)
+    return scene, device

@@ -10,14 +10,13 @@ from collections.abc import Iterable
 from signal import SIGTERM
 
 from turbogs_plugin.distributed.ranks import ONE, Ranks
-from turbogs_plugin.train.clock import TrainingClock
 from turbogs_plugin.train.history import Evaluation
-from turbogs_plugin.train.pace import IterationPace, Pace
+from turbogs_plugin.train.pace import Pace, TrainingClock
 from turbogs_plugin.train.trainer import Trainer
 
 
 class Listener:
-    """Its methods are called when something happens in a training. A listener overrides those it needs."""
+    """A listener of a training, whose methods are called when something happens. Subclasses override what they need."""
 
     def begun(self, loop: TrainingLoop) -> None:
         """The error maps are there; this process has not yet made an iteration."""
@@ -58,7 +57,7 @@ class TrainingLoop:
         ranks: Ranks = ONE,
     ) -> None:
         self.trainer = trainer
-        self.pace = pace or IterationPace(trainer.config.train)
+        self.pace = pace or Pace(trainer.config.train)
         self.listeners = list(listeners)
         self.clock = TrainingClock(trainer.device, seconds)
         self.ranks = ranks
@@ -80,22 +79,21 @@ class TrainingLoop:
         clock.seconds = self.ranks.agree(clock.seconds)
         for listener in self.listeners:
             listener.begun(self)
-        pace.start(trainer.iteration, clock.seconds)
         while not (self.finished or self.stopped):
             mark = pace.next_mark(trainer.iteration, clock.seconds)
             self.advance(mark)
             if trainer.iteration < mark:  # stopped on the way
                 break
-            due = pace.reached(trainer.iteration, clock.seconds)
+            evaluate, save = pace.reached(trainer.iteration, clock.seconds)
             trainer.set_length(pace.iterations, pace.refine_until)
             if self.finished:
                 trainer.conclude()
-            if due.evaluate or due.save:
+            if evaluate or save:
                 trainer.complete()
-            if due.evaluate:
+            if evaluate:
                 for listener in self.listeners:
                     listener.evaluation_due(self)
-            if due.save:
+            if save:
                 for listener in self.listeners:
                     listener.checkpoint_due(self)
 

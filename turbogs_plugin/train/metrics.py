@@ -1,7 +1,7 @@
 """Test errors of a model: PSNR, SSIM, mean absolute error, LPIPS and FLIP if wanted and there; rendering speed; and
 the evaluations of a training.
 
-Where views have masks, errors are of the pixels that are not masked, and errors of whole photos are given beside them.
+Where views have masks, errors are of the pixels that are not masked.
 Where photos have exposures of their own, a test view is shown with the exposure that is known of it, and errors of the
 model's own colours, before and after a colour alignment, are given beside.
 """
@@ -22,7 +22,7 @@ from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.history import MEASURES, Evaluation, FurtherErrors
 from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.loop import Listener, TrainingLoop
-from turbogs_plugin.train.perceptual import Flip, Lpips
+from turbogs_plugin.train.perceptual import ImageError
 from turbogs_plugin.types import Gaussians
 
 PSNR_LIMIT = 100.0
@@ -82,8 +82,8 @@ def evaluate(
     gaussians: Gaussians,
     views: PosedImages,
     look: Look,
-    lpips: Lpips | None = None,
-    flip: Flip | None = None,
+    lpips: ImageError | None = None,
+    flip: ImageError | None = None,
     aligned: bool = False,
     refined: bool = False,
 ) -> Metrics:
@@ -115,8 +115,6 @@ def evaluate(
         own = own.clamp(0.0, 1.0)
         if look.exposures is not None:
             further["own"] = compare(name, own, photo, mask)
-        if views.masks is not None:
-            further["whole"] = compare(name, image, photo)
         if moved is not None:
             further["refined"] = compare(name, render_view(gaussians, moved, view_id, look), photo, mask)
         if aligned:

@@ -38,14 +38,14 @@ class ParameterMean:
         self.tensors = {name: value.detach()[:0].clone() for name, value in tensors.items()}
 
     def due(self, iteration: int, total: int) -> bool:
-        """Whether the parameters after so many iterations of `total` count.
+        """Whether the parameters after this number of iterations, of `total`, count.
 
         Where none are to count yet, it begins anew: a time budget has made the run longer.
         """
         if iteration < (1.0 - self.share) * total:
             self.restart()
             return False
-        return self._counts(iteration, total)
+        return iteration % AVERAGE_EVERY == 0 or iteration == total
 
     def add(self, tensors: Mapping[str, Tensor]) -> None:
         """Add the tensors of one more iteration, which are copied. Where there are more or fewer rows, begin anew."""
@@ -58,24 +58,6 @@ class ParameterMean:
                 mean.lerp_(tensors[name].detach(), 1.0 / (self.count + 1))
         self.count += 1
 
-    def take_back(self, tensors: Mapping[str, Tensor], first: int, last: int, total: int) -> None:
-        """Take iterations `first` to `last` of `total` out again, which are made once more.
-
-        Args:
-            tensors: as each of these iterations had them, for they changed nothing.
-        """
-        times = sum(self._counts(iteration, total) for iteration in range(first, last + 1))
-        if times >= self.count:
-            self.restart()
-        elif times:
-            for name, mean in self.tensors.items():
-                mean.lerp_(tensors[name].detach(), -times / (self.count - times))
-            self.count -= times
-
-    def _counts(self, iteration: int, total: int) -> bool:
-        late = iteration >= (1.0 - self.share) * total
-        return late and (iteration % AVERAGE_EVERY == 0 or iteration == total)
-
     def restart(self) -> None:
         """Begin anew: from here on the parameters are of other Gaussians."""
         if self.count:
@@ -87,31 +69,17 @@ class ParameterMean:
         """Write the mean, if there is one, into the tensors whose mean it is, and begin anew.
 
         Raises:
-            ValueError: they have other rows.
+            RuntimeError: from torch, where they have other rows.
         """
         if self.count:
             for name, mean in self.tensors.items():
-                if mean.shape != tensors[name].shape:
-                    shapes = f"{tuple(mean.shape)}, not {tuple(tensors[name].shape)}"
-                    raise ValueError(f"the mean of {name} has shape {shapes}: restart it where rows change")
                 tensors[name].copy_(mean)
         self.restart()
 
     def state_dict(self) -> dict[str, Any]:
         return {"count": self.count, "tensors": dict(self.tensors)}
 
-    def load_state_dict(self, state: Mapping[str, Any], present: Mapping[str, Tensor]) -> None:
-        """Load a saved state.
-
-        Args:
-            present: the tensors whose mean it is, for their layout and device.
-
-        Raises:
-            ValueError: it is the mean of other tensors.
-        """
-        count, tensors = state["count"], {}
-        for name, value in present.items():
-            mean = tensors[name] = state["tensors"][name].to(value.device)
-            if mean.shape != (value if count else value[:0]).shape:
-                raise ValueError(f"the mean of {name} over {count} iterations has shape {tuple(mean.shape)}")
-        self.count, self.tensors = count, tensors
+    def load_state_dict(self, state: Mapping[str, Any], device: torch.device) -> None:
+        """Load a saved state onto a device."""
+        self.count = state["count"]
+        self.tensors = {name: value.to(device) for name, value in state["tensors"].items()}

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-import tempfile
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +17,6 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
-
-VGG16_FILE = "vgg16-397923af.pth"
-"""File name under which torchvision looks for the backbone of LPIPS."""
 
 LPIPS_PACKAGES = ("torchvision", "torchmetrics")
 """Packages with the network, and with LPIPS itself."""
@@ -31,65 +26,39 @@ FLIP_PACKAGE = "flip_evaluator"
 PIXELS_PER_DEGREE = 67.0
 """Viewing distance of FLIP: the paper's 0.7 m before a 4K screen 0.7 m wide."""
 
-Lpips = Callable[[Tensor, Tensor], float]
-"""LPIPS of two images [H, W, 3], 0 .. 1."""
-
-Flip = Callable[[Tensor, Tensor], float]
-"""Mean FLIP of an image against a photo, both [H, W, 3], 0 .. 1: 0 for equal ones, below 1."""
+ImageError = Callable[[Tensor, Tensor], float]
+"""LPIPS or mean FLIP of an image against a photo, both [H, W, 3], 0 .. 1."""
 
 
-def load_lpips(weights: str | None, device: torch.device) -> tuple[Lpips | None, str]:
-    """LPIPS (VGG16), if `LPIPS_PACKAGES` and the backbone's weights are on this machine. Nothing is downloaded.
+def load_lpips(device: torch.device) -> tuple[ImageError | None, str]:
+    """LPIPS (VGG16), if `LPIPS_PACKAGES` are installed and the backbone's weights are in torch's cache.
 
     Args:
-        weights: local file with torchvision's VGG16 weights; None: torch's own cache is searched.
         device: where to compute.
 
     Returns:
         The function, or None; and the reason for None.
 
     Raises:
-        InputError: `weights` names no readable file.
+        InputError: the file in the cache does not hold the weights.
     """
-    if weights is not None and not Path(weights).is_file():
-        raise InputError(f"report.lpips_weights: no such file '{weights}'")
     missing = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         release = torch.__version__.partition("+")[0]  # or pip may bring another torch with torchvision
-        return None, (
-            f"it needs {' and '.join(missing)} (pip install {' '.join(missing)} torch=={release}) and the weights "
-            f"{VGG16_FILE}"
-        )
-    file = Path(weights) if weights else Path(torch.hub.get_dir()) / "checkpoints" / VGG16_FILE
-    if not file.is_file():
-        return None, f"its weights are not on this machine; name a local {VGG16_FILE} in report.lpips_weights"
-    return _load_lpips(file, device), ""
-
-
-def _load_lpips(file: Path, device: torch.device) -> Lpips:
-    network = _lpips_network(file.resolve()).to(device)
-    return lambda image, photo: network(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]).item()
-
-
-@lru_cache(maxsize=1)
-def _lpips_network(file: Path) -> torch.nn.Module:
-    """The network on the CPU. A run loads it before it trains, to try it, and uses it for its report."""
+        return None, f"it needs {' and '.join(missing)}: pip install {' '.join(missing)} torch=={release}"
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / "vgg16-397923af.pth"  # torchvision's name
+    if not weights.is_file():
+        return None, f"there are no weights of VGG16 on this machine: put torchvision's file at {weights}"
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
-    cache = torch.hub.get_dir()
-    with tempfile.TemporaryDirectory() as folder:  # torchvision loads the file only from a cache
-        (Path(folder) / "checkpoints").mkdir()
-        (Path(folder) / "checkpoints" / VGG16_FILE).symlink_to(file)
-        torch.hub.set_dir(folder)
-        try:
-            return LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True)
-        except (RuntimeError, OSError, KeyError, EOFError) as error:
-            raise InputError(f"report.lpips_weights: '{file}' does not hold VGG16's weights: {error}") from None
-        finally:
-            torch.hub.set_dir(cache)
+    try:
+        network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to(device)
+    except (RuntimeError, OSError, KeyError, EOFError) as error:
+        raise InputError(f"'{weights}' does not hold VGG16's weights ({error}): remove it, or put them there") from None
+    return lambda image, photo: network(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]).item(), ""
 
 
-def load_flip() -> tuple[Flip | None, str]:
+def load_flip() -> tuple[ImageError | None, str]:
     """FLIP, if its package is installed: the function, or None; and the reason for None."""
     if importlib.util.find_spec(FLIP_PACKAGE) is None:
         return None, 'flip-evaluator is not installed; pip install "turbogs-plugin[flip]"'

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,34 +18,29 @@ from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.plan import Plan, make_plan
-from turbogs_plugin.plan.caps import cap_of
-from turbogs_plugin.plan.memory import hold_to_limit, most_views, within_memory
+from turbogs_plugin.plan.memory import hold_to_limit, most_views, require_gpu_memory, within_memory
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.clock import WallClock, WallRecord
 from turbogs_plugin.train.history import rewind_history
-from turbogs_plugin.train.inputs import open_scene, read_scene, require_possible, resolve_device, starting
+from turbogs_plugin.train.inputs import open_scene, open_started, resolve_device
 from turbogs_plugin.train.loop import TrainingLoop
-from turbogs_plugin.train.pace import fitted_to_time, pace_of
-from turbogs_plugin.train.perceptual import load_lpips
+from turbogs_plugin.train.pace import Pace, fitted_to_time
 from turbogs_plugin.train.run_files import RunFolder
+from turbogs_plugin.train.saved_model import require_model
 from turbogs_plugin.train.session import Report, RunSession, Watch
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians
 
 IMPORTS, CAMERAS = "interpreter and imports", "cameras of photos alone"
-PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
-"""Parts of the wall time before a plan is made."""
+"""Parts of the wall time before photos are decoded."""
 
 
 def plan_run(config: Config, processes: int = 1) -> Plan:
-    """The plan that `train` would make now. The capture's notes are printed.
-
-    Args:
-        processes: that would train together.
+    """The plan that `train` would make now for so many processes that train together. The capture's notes are printed.
 
     Raises:
-        InputError: anything wrong with the input.
+        InputError: as `train`.
     """
     require_possible(config)
     device = resolve_device(config.train.device)
@@ -54,6 +48,21 @@ def plan_run(config: Config, processes: int = 1) -> Plan:
     plan = make_plan(config, scene, device, processes)
     print("\n".join(scene.notes), file=sys.stderr)  # last, as an error is one line alone
     return plan
+
+
+def require_possible(config: Config) -> None:
+    """Refuse a device or a limit of its memory that this machine lacks, and a model to start from that is not there,
+    before photos are looked at.
+
+    Raises:
+        InputError: one of these.
+    """
+    if config.train.device == "cuda":
+        resolve_device("cuda")
+    if config.budget.max_memory:
+        require_gpu_memory(resolve_device(config.train.device))
+    if config.train.starts_from_model:
+        require_model(config.train.init)
 
 
 def new_loop(config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE) -> TrainingLoop:
@@ -71,30 +80,15 @@ def new_loop(config: Config, scene: Scene, device: torch.device, ranks: Ranks = 
     if device.type == "cuda" and views > MAX_VIEWS:
         raise InputError(f"schedule: {views} views an iteration, and a GPU takes at most {MAX_VIEWS}: ask for fewer")
     hold_to_limit(config, device)
-    config, seconds = fitted_to_time(within_memory(_agreed(config, ranks), scene), scene, device, ranks)
+    if ranks.count > 1:  # the first process's plan: plans look at the machine's free memory, which differs
+        config = resolve(ranks.agree(config.to_mapping()))
+    config, seconds = fitted_to_time(within_memory(config, scene), scene, device, ranks)
     trainer = Trainer(config, scene, device, engine=ranks.engine(device))
-    return TrainingLoop(trainer, pace_of(config), seconds=seconds, ranks=ranks)
-
-
-def budget_text(config: Config) -> str:
-    """The budgets of a run that `new_loop` has fitted to them, for a terminal; empty if there are none."""
-    parts = []
-    if cap_of(config):
-        parts.append(f"at most {cap_of(config)} Gaussians at the end")
-    if config.budget.max_memory:
-        parts.append(f"{config.budget.max_memory} of device memory")
-    if config.budget.time:
-        parts.append(f"{config.budget.time} of training: about {config.train.iterations} iterations")
-    return f"budget: {'; '.join(parts)}" if parts else ""
-
-
-def _agreed(config: Config, ranks: Ranks) -> Config:
-    """The first process's configuration: plans look at the machine's free memory, which differs."""
-    return config if ranks.count == 1 else resolve(ranks.agree(config.to_mapping()))
+    return TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), seconds=seconds, ranks=ranks)
 
 
 def fit(scene: Scene | Path | str, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussians:
-    """Train in memory: nothing is written, nothing is printed.
+    """Train in memory: nothing is written, and only a count of photos is shown while they are decoded.
 
     Args:
         scene: a loaded one, its photos in host memory; or the folder of a capture, which the section `scene` of the
@@ -112,7 +106,7 @@ def fit(scene: Scene | Path | str, *overrides: str, config: str = DEFAULT_CONFIG
     settings = load_config(config, overrides)
     device = resolve_device(settings.train.device)
     if isinstance(scene, str | Path):
-        scene = read_scene(scene, settings)
+        scene = open_scene(replace(settings, scene=replace(settings.scene, path=str(scene))))
     else:
         scene = refine_cameras(scene, settings.train.refine_cameras)
     loop = new_loop(make_plan(settings, scene, device).apply(settings), scene, device)
@@ -147,16 +141,11 @@ def train(
     if ranks.first:
         folder.require_new()
     require_possible(config)
-    _try_lpips(config, report is not None)
-    posed = ranks.agree(_posed_capture(config, out) if ranks.first else None)
+    posed = ranks.agree(_posed_capture(config, out) if ranks.first else "")
     if posed != config.scene.path:
         clock.mark(CAMERAS)
         config = replace(config, scene=replace(config.scene, path=posed))
-    with starting(lambda: resolve_device(config.train.device), ranks) as started:
-        scene = open_scene(config, ranks=ranks)
-        clock.mark(PHOTOS)
-        device = started.result()
-    clock.mark(DEVICE)
+    scene, device = open_started(config, lambda: resolve_device(config.train.device), clock, ranks=ranks)
     plan = make_plan(config, scene, device, ranks.count)
     clock.mark("plan")
     remedy = "use train.photos_place=host and train.maps_place=host, --max-gaussians or a larger --factor"
@@ -165,8 +154,9 @@ def train(
         session = RunSession(folder, plan, scene, loop, clock)
     if ranks.first:
         resolved = loop.trainer.config
-        said = [*scene.notes, plan.text(), budget_text(resolved)]
-        print("\n".join(filter(None, said)), file=sys.stderr)
+        print("\n".join([*scene.notes, plan.text()]), file=sys.stderr)
+        if resolved.budget.time:
+            print(f"{resolved.budget.time} of training: about {resolved.train.iterations} iterations", file=sys.stderr)
         folder.path.mkdir(parents=True, exist_ok=True)
         write_text_atomically(folder.plan, plan.to_json())
         write_text_atomically(folder.asked, config.to_yaml())
@@ -195,44 +185,33 @@ def resume(
     config, plan = folder.read_config(), folder.read_plan()
     earlier = WallRecord.read(folder.wall)
     checkpoint = latest_checkpoint(folder.checkpoints)
-    if checkpoint is None:
-        folder.require_unfinished()
+    if checkpoint is None and folder.model.is_file():
+        raise InputError(f"'{path}' is finished and has no checkpoint to go on from: use its {folder.model.name}")
     state = None if checkpoint is None else load_checkpoint(checkpoint)
     device = resolve_device(config.train.device, "go on with this run where there is a GPU, or see 'turbogs doctor'")
     require_writable(folder.path, f"what --resume {folder.path} writes")
-    _try_lpips(config, report is not None)
-    with starting(lambda: device, ranks) as started:
-        scene = open_scene(config, folder, ranks=ranks)
-        clock.mark(PHOTOS)
-        started.result()
-    clock.mark(DEVICE)
+    scene, device = open_started(config, lambda: device, clock, folder, ranks)
     hold_to_limit(config, device)
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
         resuming = state is not None
         trainer = Trainer(config, scene, device, resuming, ranks.engine(device))
-        loop = TrainingLoop(trainer, pace_of(config), ranks=ranks)
+        loop = TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), ranks=ranks)
         session = RunSession(folder, plan, scene, loop, clock)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))
-            session.earlier_wall = earlier.wall_seconds if earlier else math.nan
+            session.earlier_wall = earlier.wall_seconds if earlier else None
     if ranks.first:
         session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
     return session.run(report, watch)
 
 
 def _posed_capture(config: Config, out: Path) -> str:
-    """The path of the capture; where that is of photos alone, of their reconstruction, which is made."""
+    """The path of the capture; for photos alone, the path of their reconstruction, which is made."""
     if not holds_photos_alone(Path(config.scene.path)):
         return config.scene.path
     from turbogs_plugin.reconstruct.run import reconstruct_beside  # no other run needs that room
 
     return str(reconstruct_beside(Path(config.scene.path), out))
-
-
-def _try_lpips(config: Config, reported: bool) -> None:
-    """Load LPIPS, which the report uses, so that weights that cannot be read are refused before photos are."""
-    if reported or config.report.lpips_weights is not None:
-        load_lpips(config.report.lpips_weights, torch.device("cpu"))
 
 
 @contextmanager
@@ -249,7 +228,5 @@ def _independent(config: Config, device: torch.device) -> Config:
     config.scene.path = str(Path(config.scene.path).resolve())
     if config.train.starts_from_model:
         config.train.init = str(Path(config.train.init).resolve())
-    if config.report.lpips_weights is not None:
-        config.report.lpips_weights = str(Path(config.report.lpips_weights).resolve())
     config.train.device = device.type
     return config

@@ -9,7 +9,6 @@ from turbogs_plugin.config.configuration import Config, resolve_complete
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable
 from turbogs_plugin.plan import Plan
-from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.yaml_json import read_yaml
 
 
@@ -47,32 +46,10 @@ class RunFolder:
             raise InputError(f"--out '{self.path}' is not empty: choose a new folder")
         require_writable(self.path, f"--out '{self.path}'")
 
-    def require_unfinished(self) -> None:
-        """Raise `InputError` where a run has its model but no checkpoint: training anew would replace its history."""
-        if self.model.is_file():
-            raise InputError(
-                f"'{self.path}' is finished, for its {self.model.name} is there, and has no checkpoint to go on from: "
-                "use that model, or train anew with another --out"
-            )
-
-    def finished_text(self, reported: bool) -> str:
-        """``RUN is finished: N of N iterations`` where nothing of a run is left to do, else "".
-
-        Args:
-            reported: whether its report is asked for.
-        """
-        if not self.model.is_file() or (reported and not self.report.is_file()):
-            return ""
-        config, checkpoint = self.read_config(), latest_checkpoint(self.checkpoints)
-        if checkpoint is None:
-            return ""
-        state = load_checkpoint(checkpoint)
-        try:
-            iteration = state["trainer"]["iteration"]
-            total = state["pace"].get("iterations", config.train.iterations)  # of a time budget, the pace knows better
-            return f"{self.path} is finished: {iteration} of {total} iterations" if iteration >= total else ""
-        except (KeyError, TypeError, AttributeError):
-            return ""  # a resume from this checkpoint says what is wrong with it
+    def finished(self, reported: bool) -> bool:
+        """Whether nothing of the run is left to do: its model is there, which is written at the end, and its report if
+        that is `reported`."""
+        return self.model.is_file() and (self.report.is_file() or not reported)
 
     def discard(self) -> None:
         """Remove what a run wrote that never came to a checkpoint, and the folder if nothing else is in it."""

@@ -1,25 +1,38 @@
-"""Models to render, measure or hand over: a run's newest one, or one that was trained anywhere."""
+"""Models to render, measure, hand over or start from: a run's newest one, or one that was trained anywhere.
+
+A model from a file is taken to be in its capture's own coordinates. gsplat's example trainer works in others unless it
+is told not to (`turbogs_plugin.model.gsplat_world`); `train.init_world` says which.
+"""
 
 from __future__ import annotations
 
-import operator
+import re
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.captures.fingerprint import frame_of_state
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.formats import FORMATS
+from turbogs_plugin.model.gsplat_file import read_gsplat
+from turbogs_plugin.model.gsplat_world import out_of_gsplat_world
+from turbogs_plugin.model.similarity import Similarity, placed
+from turbogs_plugin.model.torch_file import read_plain
 from turbogs_plugin.scene import Frame, PosedImages, Scene
-from turbogs_plugin.train.checkpoint import gaussians_of_state, latest_checkpoint, load_checkpoint
-from turbogs_plugin.train.given_model import load_given, require_model
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.train.look import Background, Look
 from turbogs_plugin.train.run_files import RunFolder
-from turbogs_plugin.types import Gaussians
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
+
+REMEDY = "; save the model again, or as a .ply"
+KINDS = "a .ply, .splat, .spz or gsplat's .pt of a 3DGS model, a checkpoint of TurboGS, or a run's folder"
 
 
 @dataclass
@@ -41,8 +54,7 @@ class SavedModel:
     @property
     def sh_degree(self) -> int:
         """Degree of the bands in use; all bands of a model from a file, which does not say."""
-        given = self.iteration is None
-        return self.gaussians.sh_degree if given else self.config.train.sh_degree_at(self.iteration)
+        return self.gaussians.sh_degree if self.iteration is None else self.config.train.sh_degree_at(self.iteration)
 
     def own_look(self, views: PosedImages | None = None) -> Look:
         """Look of the model's own colours, on the background of evaluations and without exposures, beside views of its
@@ -64,20 +76,19 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
     config = folder.read_config()
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None:
-        quoted = shlex.quote(str(path))
-        if folder.model.is_file():
-            scene = shlex.quote(config.scene.path)
-            raise InputError(
-                f"'{path}' has no checkpoint: give its model by  {shlex.quote(str(folder.model))} --scene {scene}"
-            )
-        raise InputError(f"'{path}' has no checkpoint yet: let the run go on with  turbogs train --resume {quoted}")
+        run, model = shlex.quote(str(path)), shlex.quote(str(folder.model))
+        raise InputError(
+            f"'{path}' has no checkpoint: let the run go on with  turbogs train --resume {run}, or give its finished "
+            f"model by  {model} --scene {shlex.quote(config.scene.path)}"
+        )
     state = load_checkpoint(checkpoint)
     try:
-        frame = frame_of_state(state)
         trained = state["trainer"]
-        iteration = operator.index(trained["iteration"])
+        gaussians = read_gsplat({"splats": trained["gaussians"]}, checkpoint).map(
+            lambda value: value.float().to(device)
+        )
         exposures = trained["exposures"]["offsets"].to(device) if config.train.exposure is True else None
-        return SavedModel(folder, config, gaussians_of_state(trained, device), frame, iteration, exposures)
+        return SavedModel(folder, config, gaussians, frame_of_state(state), int(trained["iteration"]), exposures)
     except (KeyError, TypeError, AttributeError, IndexError, ValueError, RuntimeError) as error:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
 
@@ -106,3 +117,103 @@ def load_with_capture(
         if needed:
             raise
         return model, None, str(error)
+
+
+def require_model(path: str | Path) -> Path:
+    """The file of a model: itself, or the newest checkpoint of a run's folder.
+
+    Raises:
+        InputError: there is none, or it is of no kind that is read.
+    """
+    path = Path(path)
+    if path.is_dir():
+        checkpoint = latest_checkpoint(path / "checkpoints")
+        if checkpoint is None:
+            raise InputError(f"'{path}' is a folder without a checkpoint of a run: give {KINDS}")
+        return checkpoint
+    if not path.is_file():
+        raise InputError(f"no such model '{path}': give {KINDS}")
+    if path.suffix.lower().removeprefix(".") not in FORMATS:
+        raise InputError(f"'{path}' is no model: give {KINDS}")
+    return path
+
+
+def load_given(path: str | Path, scene: Scene, world: str = "capture") -> Gaussians:
+    """A model from a file, in the frame of a scene. A warning counts Gaussians that are not finite, which are left out.
+
+    Args:
+        path: as `require_model` takes it.
+        scene: the capture that it was trained on.
+        world: `train.init_world`, the coordinates of a model that is not one of ours: ``capture`` or ``gsplat``.
+
+    Returns:
+        float32, on the CPU.
+
+    Raises:
+        InputError: the file is no such model, or the capture does not determine gsplat's world.
+    """
+    file = require_model(path)
+    into = Similarity.into(scene.frame)
+    gaussians, to_capture = _read(file)
+    if to_capture is None and world == "gsplat":
+        points = scene.frame.restore_points(scene.points.cpu().numpy())
+        to_capture = out_of_gsplat_world(gaussians, _own_viewmats(scene), points, scene.point_colors.cpu().numpy())
+        if to_capture is None:
+            raise InputError(
+                f"{file}: the cameras and points of {scene.name} do not determine gsplat's normalised world: train the "
+                "model with --no-normalize-world-space, and leave train.init_world out"
+            )
+    return placed(gaussians, into if to_capture is None else into.after(to_capture), file)
+
+
+def read_given(path: str | Path) -> Gaussians:
+    """A model from a file alone, whatever capture it belongs to.
+
+    Returns:
+        float64, on the CPU, in the file's own coordinates; rows may be not finite.
+
+    Raises:
+        InputError: the file is no such model (`require_model`).
+    """
+    return _read(require_model(path))[0]
+
+
+def _read(file: Path) -> tuple[Gaussians, Similarity | None]:
+    """The model of a file in float64, and the change to the capture's own coordinates where the file knows it."""
+    kind = file.suffix.lower().removeprefix(".")
+    if kind != "pt":
+        return FORMATS[kind].read(file), None
+    state = read_plain(file, f"'{file}'", REMEDY)
+    if isinstance(state, Mapping) and "splats" in state:
+        files = [file, *_other_ranks(file)]
+        parts = [read_gsplat(read_plain(part, f"'{part}'", REMEDY), part) for part in files]
+        if len({part.shN.shape[1] for part in parts}) > 1:
+            raise InputError(f"{file}: the files of its ranks differ in degree: give those of one run")
+        names = PARAMETER_NAMES
+        return Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names}), None
+    try:
+        gaussians = read_gsplat({"splats": state["trainer"]["gaussians"]}, file)
+        return gaussians, Similarity.into(frame_of_state(state)).inverse()
+    except (KeyError, TypeError):
+        keys = ", ".join(sorted(map(str, state))[:6]) if isinstance(state, Mapping) else type(state).__name__
+        raise InputError(
+            f"{file} is neither gsplat's checkpoint (step, splats) nor one of TurboGS (it has {keys}): give {KINDS}"
+        ) from None
+
+
+def _other_ranks(file: Path) -> list[Path]:
+    """The files with the rest of a model that several GPUs trained: ckpt_STEP_rank1.pt beside ckpt_STEP_rank0.pt."""
+    name = re.fullmatch(r"(.*_rank)\d+\.pt", file.name)
+    if name is None:
+        return []
+    alike = re.compile(re.escape(name[1]) + r"\d+\.pt")
+    return sorted(path for path in file.parent.iterdir() if path != file and alike.fullmatch(path.name))
+
+
+def _own_viewmats(scene: Scene) -> np.ndarray:
+    """[V, 4, 4] float64 world to camera of all views, in the capture's own coordinates."""
+    both = (scene.train.cameras.viewmats, scene.test.cameras.viewmats)
+    viewmats = torch.cat([part.cpu() for part in both]).double().numpy()
+    frame = scene.frame
+    viewmats[:, :3, 3] = viewmats[:, :3, 3] * frame.scale - viewmats[:, :3, :3] @ frame.center
+    return viewmats

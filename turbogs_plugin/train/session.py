@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Any
 
@@ -26,44 +25,31 @@ from turbogs_plugin.train.metrics import Evaluations
 from turbogs_plugin.train.progress import TrainingProgress
 from turbogs_plugin.train.run_files import RunFolder
 
-MODEL, CHECKPOINT = "model, after the pictures", "checkpoint, after the report"
-"""Parts of the wall time at the end, in which the run only waits for these files."""
-
 Report = Callable[["RunSession"], object]
 """Writes the report of a finished run."""
 Watch = Sequence[Callable[["RunSession"], Listener]]
-"""Each is called with a run before it trains, and gives one more listener of the first process's loop."""
+"""Functions that are called with a run before it trains, and give one more listener of its first process each."""
 
 
-class Interrupts:
-    """SIGINT and SIGTERM while training: the first asks training to stop after this iteration, a second stops at once.
+@contextmanager
+def interruptible(stop: Callable[[int], None]) -> Iterator[None]:
+    """While entered, the first SIGINT or SIGTERM calls `stop` with its number, and a second one ends the process.
 
     Python allows handlers in the main thread alone; in others signals keep their usual effect.
-
-    Args:
-        stop: called at the first signal, with its number.
     """
+    handled = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
 
-    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+    def handle(number: int, frame: FrameType | None) -> None:
+        for each in handled:
+            signal.signal(each, signal.default_int_handler)
+        stop(number)
 
-    def __init__(self, stop: Callable[[int], None]) -> None:
-        self.signal: int | None = None
-        self._stop = stop
-
-    def __enter__(self) -> Interrupts:
-        handled = self.SIGNALS if threading.current_thread() is threading.main_thread() else ()
-        self._previous = {number: signal.signal(number, self._handle) for number in handled}
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for number, handler in self._previous.items():
+    previous = {number: signal.signal(number, handle) for number in handled}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
             signal.signal(number, handler)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.signal is not None:
-            raise KeyboardInterrupt
-        self.signal = number
-        self._stop(number)
 
 
 class RunSession(Listener):
@@ -76,17 +62,16 @@ class RunSession(Listener):
         resumed: whether the trainer's state was loaded.
         signal: the signal that stopped the training; None at the end of the run.
         clock: of the wall, in this process.
-        earlier_wall: seconds on the wall of the processes before; NaN where one did not record them.
+        earlier_wall: seconds on the wall of the processes before; None where one did not record them.
         wall: what is recorded of it when the model is written.
-
-    At the end of a run, threads write checkpoint and model while the report's pictures are made.
     """
 
     def __init__(
         self, folder: RunFolder, plan: Plan | None, scene: Scene, loop: TrainingLoop, clock: WallClock | None = None
     ) -> None:
         self.folder, self.plan, self.scene, self.loop = folder, plan, scene, loop
-        self.clock, self.earlier_wall, self.wall = clock or WallClock(), 0.0, WallRecord(0.0)
+        self.clock, self.wall = clock or WallClock(), WallRecord(0.0)
+        self.earlier_wall: float | None = 0.0
         self.trainer = loop.trainer
         self.test = place_views(scene.test, self.trainer.device, self.trainer.config.train.photos_place)
         self.evaluations = Evaluations(self.test)
@@ -94,46 +79,41 @@ class RunSession(Listener):
         self.resumed = False
         self.signal: int | None = None
         self._saved_at = -1
-        self._finished_before = False
-        self._threads = ThreadPoolExecutor(2, "files")
-        self._model: Future[float] | None = None
-        self._checkpoint: Future[float] | None = None
 
     def run(self, report: Report | None, watch: Watch = ()) -> RunSession:
-        """Train to the end, or until a signal; both end with a checkpoint."""
+        """Train to the end, or until a signal; both end with a checkpoint. The model is written before it."""
         loop, trainer, ranks = self.loop, self.trainer, self.loop.ranks
-        self._finished_before = loop.finished
+        finished_before = loop.finished
         if ranks.first:
             self.folder.wall.unlink(missing_ok=True)  # so that a killed process leaves none: it is not counted as 0
         self.clock.mark("initial model")
         try:
-            shown = TrainingProgress(trainer.iterations, trainer.iteration) if ranks.first else nullcontext()
-            with Interrupts(loop.stop) as interrupts, shown:
-                # First the session, so that its marks tell apart what the others do.
-                loop.listeners = [self, self.evaluations, shown] if ranks.first else [self]
-                loop.listeners += [listener_of(self) for listener_of in watch if ranks.first]
+            with interruptible(self._stop), ExitStack() as shown:
+                loop.listeners = [self]  # first, so that its marks tell apart what the others do
+                if ranks.first:
+                    progress = shown.enter_context(TrainingProgress())
+                    loop.listeners += [self.evaluations, progress, *(listener_of(self) for listener_of in watch)]
                 loop.run(self.resumed)
                 self.clock.mark("training")
-                if loop.stopped and trainer.iteration != self._saved_at:
+                if loop.finished and ranks.first:
+                    trainer.require_finite()
+                    save_ply(trainer.gaussians, self.folder.model, self.scene.frame)
+                    self.clock.mark("model")
+                seconds = 0.0 if finished_before else self.clock.seconds
+                if trainer.iteration != self._saved_at:
                     trainer.complete()
                     self._save()
-            self.signal = None if loop.finished else ranks.stop_signal or interrupts.signal
+            self.signal = None if loop.finished else ranks.stop_signal or self.signal
             if not ranks.first:
                 return self
-            if loop.finished:
-                self._model = self._in_thread(save_ply, trainer.gaussians, self.folder.model, self.scene.frame)
-                if report is not None:
-                    report(self)
-            self.finish_model()
-            if self._checkpoint is not None:
-                self._checkpoint.result()
-            self.clock.mark(CHECKPOINT)
-            self.wall.parts = self.clock.parts
+            wall = None if self.earlier_wall is None else self.earlier_wall + seconds
+            self.wall = WallRecord(loop.clock.seconds, wall, self.clock.parts)
+            if loop.finished and report is not None:
+                report(self)
             self.wall.write(self.folder.wall)
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
         except InputError as error:  # in an iteration: from a strategy of one's own, say
-            self._threads.shutdown()
             if latest_checkpoint(self.folder.checkpoints) is not None:
                 raise TrainingStopped(f"{error}; {self._last_good()}") from error
             if ranks.first:
@@ -144,17 +124,11 @@ class RunSession(Listener):
                 f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)} "
                 f"Gaussians; try --max-gaussians {round(0.7 * len(trainer.gaussians))}; {self._last_good()}"
             ) from error
-        finally:
-            self._threads.shutdown()
         return self
 
-    def finish_model(self) -> None:
-        """Wait until the model is written, if the run is finished, and set `wall`. The checkpoint, which is many times
-        larger, may come later. Raises `TrainingStopped` if the disk refused."""
-        end = self.clock.seconds if self._model is None else self._model.result()
-        self.clock.mark(MODEL)
-        seconds = 0.0 if self._finished_before else end
-        self.wall = WallRecord(self.loop.clock.seconds, self.earlier_wall + seconds, self.clock.parts)
+    def _stop(self, number: int) -> None:
+        self.signal = number
+        self.loop.stop(number)
 
     def begun(self, loop: TrainingLoop) -> None:
         self.clock.mark("initial maps")
@@ -167,9 +141,9 @@ class RunSession(Listener):
         append_evaluation(self.folder.history, evaluation)
 
     def checkpoint_due(self, loop: TrainingLoop) -> None:
-        self.clock.mark("training")
-        self._save()
-        self.clock.mark("checkpoints")
+        if not loop.finished:
+            self.clock.mark("training")
+            self._save()
 
     def state_dict(self) -> dict[str, Any]:
         return {
@@ -189,7 +163,7 @@ class RunSession(Listener):
                 self.trainer.set_length(loop.pace.iterations, loop.pace.refine_until)
                 self.trainer.load_state_dict(state["trainer"])
                 loop.clock.seconds = state["train_seconds"]
-                self.resumed = True
+                self.resumed, self._saved_at = True, self.trainer.iteration
         except torch.cuda.OutOfMemoryError:  # a RuntimeError too, but not the checkpoint's fault
             raise
         except (KeyError, TypeError, AttributeError, IndexError, ArithmeticError, RuntimeError, ValueError) as error:
@@ -202,26 +176,13 @@ class RunSession(Listener):
             )
 
     def _save(self) -> None:
-        """Write a checkpoint; at the end of the run, when nothing changes the state any more, by a thread."""
+        """Write a checkpoint. Raises `TrainingStopped` for a model that is not finite, or where the disk refused."""
         self.trainer.require_finite()
         if self.loop.ranks.first:
-            arguments = (self.folder.checkpoints, self.trainer.iteration, self.state_dict())
-            if self.loop.finished:
-                self._checkpoint = self._in_thread(save_checkpoint, *arguments)
-            else:
-                save_checkpoint(*arguments)
+            save_checkpoint(self.folder.checkpoints, self.trainer.iteration, self.state_dict())
         self._saved_at = self.trainer.iteration
-
-    def _in_thread(self, write: Callable[..., object], *arguments: object) -> Future[float]:
-        """Begin to write a file. The result is when it was written, in seconds on the wall."""
-
-        def timed() -> float:
-            write(*arguments)
-            return self.clock.seconds
-
-        return self._threads.submit(timed)
+        self.clock.mark("checkpoints")
 
     def _last_good(self) -> str:
-        self._threads.shutdown()  # it may still be on its way to the disk
         checkpoint = latest_checkpoint(self.folder.checkpoints)
         return f"the last good checkpoint is '{checkpoint}'" if checkpoint else "no checkpoint was saved before"

@@ -6,6 +6,7 @@ The state that iterations change is in `turbogs_plugin.train.training_state`, th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -16,14 +17,12 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine, engine_of
 from turbogs_plugin.engine.exposures import exposure_rate
 from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
-from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import Dropout
-from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.limits import RESTRAIN_EVERY, Clearance, restrain_distant
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.strategy_results import require_output, require_samples
 from turbogs_plugin.train.training_state import TrainingState
 from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
@@ -74,30 +73,6 @@ class Trainer(TrainingState):
             self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)
         self.observer: IterationObserver | None = None
 
-    def initialise_maps(self) -> None:
-        """Set the maps to the errors of a dense render of the initial Gaussians, Algorithm 1's initialization."""
-        pixels = self.maps.sizes.prod(axis=1).tolist()
-        for view_id, errors in enumerate(self.engine.each_view(self.dense_errors, pixels)):
-            self.maps.initialise(view_id, errors)
-        self.initial_error = self.maps.mean()
-
-    def dense_errors(self, view_id: int) -> Tensor:
-        """[H * W] the errors of a dense render of one view; 0 at masked pixels."""
-        background, masks = self.background.at(self.now), self.maps.masks
-        samples = dense_samples(self.views.cameras, [view_id]) if masks is None else masks.pixels([view_id])
-        rendered = rasterize(
-            self.gaussians,
-            self.views.cameras.select([view_id]),
-            samples,
-            sh_degree=self.sh_degree,
-            settings=self.config.raster,
-            background=background,
-        )
-        truth = self.views.photos.at(samples, background).colors()  # [P, 3]
-        errors = truth.new_zeros(int(self.maps.sizes[view_id].prod()))
-        errors[samples.pixel_ids.long()] = (self.shown(rendered.colors, samples) - truth).abs().sum(dim=-1)
-        return errors
-
     def step(self) -> None:
         """One iteration, in the paper's order."""
         self.repeat_lost()
@@ -109,7 +84,6 @@ class Trainer(TrainingState):
         budget = self.schedule.query(step, mean_error, self.initial_error, len(self.views))
 
         # 2) View selection
-        self.remember_views()
         view_ids = self.view_sampler.select(budget.views, view_errors, step)
 
         # 3) Pixel sampling
@@ -126,7 +100,9 @@ class Trainer(TrainingState):
 
         # 5) Sparse forward rendering
         cameras = self.views.cameras.select(view_ids)
-        options = RenderOptions(self.sh_degree, self.config.raster, background=background, dropout=self.dropout)
+        share = float(self.config.train.dropout) if self.iteration < DROPOUT_UNTIL * self.iterations else 0.0
+        dropout = Dropout(share, step.seed, self.iteration)
+        options = RenderOptions(self.sh_degree, self.config.raster, background=background, dropout=dropout)
         rendered = self.engine.render(self.gaussians, cameras, samples, options)
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
@@ -147,12 +123,6 @@ class Trainer(TrainingState):
         if self.parameter_mean is not None and self.parameter_mean.due(self.iteration, self.iterations):
             self.parameter_mean.add(self.learnt())
 
-    @property
-    def dropout(self) -> Dropout:
-        """What this iteration leaves out of the model."""
-        share = float(self.config.train.dropout) if self.iteration < DROPOUT_UNTIL * self.iterations else 0.0
-        return Dropout(share, self.config.train.seed, self.iteration)
-
     def supervise(self, colors: Tensor, truth: GroundTruth, step: Step) -> LossOutput:
         """Loss and error maps, and the exposures of the photos where they are learnt.
 
@@ -171,10 +141,6 @@ class Trainer(TrainingState):
         rate, gradients = exposure_rate(step), loss.color_gradients
         gradients = self.engine.learn_exposures(self.exposures, colors, gradients, samples=samples, rate=rate)
         return replace(loss, color_gradients=gradients)
-
-    def shown(self, colors: Tensor, samples: PixelSamples) -> Tensor:
-        """[P, 3]: the model's colours at samples [P, 3], with the exposures of their photos where there are any."""
-        return colors if self.exposures is None else self.engine.expose(self.exposures, colors, samples)
 
     def update(self, screen: ScreenGradients, stats: GaussianStats | None, step: Step) -> None:
         """Gradients, statistics and update: in one step if the optimizer has a rule, else by its own code."""
@@ -220,3 +186,22 @@ class Trainer(TrainingState):
             self.change_rows(update)
         if self.config.train.distant_size > 0 and self.iteration % RESTRAIN_EVERY == 0:
             restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
+
+
+def require_samples(samples: PixelSamples, view_ids: Sequence[int], name: str) -> None:
+    """Raise `InputError` unless `samples` of the pixel sampler `name` are of these views, in this order: photos and
+    error maps of other views would be compared with renders of these."""
+    if samples.view_ids != tuple(view_ids):
+        raise InputError(
+            f"pixel_sampler.type '{name}' returned samples of views {samples.view_ids}, asked for {tuple(view_ids)}: "
+            "give view_ids to PixelSamples, or to from_mask and from_coordinates"
+        )
+
+
+def require_output(output: LossOutput, colors: Tensor, name: str) -> None:
+    """Raise `InputError` unless the shapes of a `LossOutput` of the loss `name` fit colours [P, 3]."""
+    shapes = {"loss": (), "color_gradients": tuple(colors.shape), "pixel_errors": (len(colors),)}
+    for field, shape in shapes.items():
+        found = tuple(getattr(output, field).shape)
+        if found != shape:
+            raise InputError(f"loss.type '{name}' returned {field} of shape {found}, not {shape}")

@@ -1,12 +1,11 @@
 """What iterations of training change: the model, the error maps and the state of the strategies.
 
 `Trainer` makes the iterations. Here is what is done with their state as a whole: it is saved and loaded, made complete,
-taken back where an engine had too little memory, and shown.
+taken back where an engine had too little memory, and shown. The first error maps are errors of the initial model.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,17 +14,15 @@ from torch import Tensor
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine
+from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.model.gsplat_file import read_gsplat
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_maps, place_views
-from turbogs_plugin.train.checkpoint import gaussians_of_state
 from turbogs_plugin.train.initial_state import first_exposures, initial_gaussians
 from turbogs_plugin.train.look import Background, Look, interpolated_exposures
 from turbogs_plugin.train.parameter_mean import ParameterMean
-from turbogs_plugin.types import Gaussians, RowUpdate, Step
-
-REPEATED_AT_MOST = 32
-"""Upper bound on the iterations that an engine skips before `Engine.settle` says so."""
+from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
 
 STATEFUL = ("maps", "view_sampler", "optimizer", "density")
 """Attributes that have a state of their own."""
@@ -68,7 +65,6 @@ class TrainingState:
         self.initial_error = 0.0
         self.nonfinite_losses = torch.zeros((), dtype=torch.int64, device=device)
         self._earliest = 0  # the iteration after the latest change of the set of Gaussians: see `repeat_lost`
-        self._before_views: deque[tuple[int, dict[str, Any]]] = deque(maxlen=REPEATED_AT_MOST)
 
     def begin_with(self, gaussians: Gaussians) -> None:
         """Train this model from now on, with optimizer and density control as at the start."""
@@ -109,6 +105,34 @@ class TrainingState:
         """Highest degree of spherical harmonics in use."""
         return self.config.train.sh_degree_at(self.iteration)
 
+    def initialise_maps(self) -> None:
+        """Set the maps to the errors of a dense render of the initial Gaussians, Algorithm 1's initialization."""
+        pixels = self.maps.sizes.prod(axis=1).tolist()
+        for view_id, errors in enumerate(self.engine.each_view(self.dense_errors, pixels)):
+            self.maps.initialise(view_id, errors)
+        self.initial_error = self.maps.mean()
+
+    def dense_errors(self, view_id: int) -> Tensor:
+        """[H * W] the errors of a dense render of one view; 0 at masked pixels."""
+        background, masks = self.background.at(self.now), self.maps.masks
+        samples = dense_samples(self.views.cameras, [view_id]) if masks is None else masks.pixels([view_id])
+        rendered = rasterize(
+            self.gaussians,
+            self.views.cameras.select([view_id]),
+            samples,
+            sh_degree=self.sh_degree,
+            settings=self.config.raster,
+            background=background,
+        )
+        truth = self.views.photos.at(samples, background).colors()  # [P, 3]
+        errors = truth.new_zeros(int(self.maps.sizes[view_id].prod()))
+        errors[samples.pixel_ids.long()] = (self.shown(rendered.colors, samples) - truth).abs().sum(dim=-1)
+        return errors
+
+    def shown(self, colors: Tensor, samples: PixelSamples) -> Tensor:
+        """[P, 3]: the model's colours at samples [P, 3], with the exposures of their photos where there are any."""
+        return colors if self.exposures is None else self.engine.expose(self.exposures, colors, samples)
+
     def learnt(self) -> dict[str, Tensor]:
         """All tensors that iterations learn, by name: the model's, and the exposures of the photos."""
         exposures = {} if self.exposures is None else {"exposures": self.exposures.offsets}
@@ -126,14 +150,9 @@ class TrainingState:
             exposures = interpolated_exposures(self.exposures.offsets, self.views.names, photos)
         return Look(self.sh_degree, self.config.raster, self.background.evaluated, exposures)
 
-    def remember_views(self) -> None:
-        """Keep the view sampler's state before it selects the views of this iteration, for `repeat_lost`."""
-        self._before_views.append((self.iteration, self.view_sampler.state_dict()))
-
     def repeat_lost(self, wait: bool = False) -> None:
         """Go back by the iterations that were skipped: where the engine has too little memory for an iteration, that
-        one and those after it change nothing until the engine is settled. They are made again with the views they had;
-        otherwise, views that take much memory would be looked at less often.
+        one and those after it change nothing until the engine is settled. They are made again, with views chosen anew.
 
         Training never goes back past a change of the set of Gaussians, which would then be made twice: iterations
         skipped just before such a change are lost.
@@ -146,11 +165,6 @@ class TrainingState:
         """
         lost, last = self.engine.settle(wait), self.iteration
         self.iteration = max(last - lost, min(self._earliest, last))
-        if lost and self.parameter_mean is not None:
-            self.parameter_mean.take_back(self.learnt(), self.iteration + 1, last, self.iterations)
-        while lost and self._before_views and self._before_views[-1][0] >= self.iteration:
-            _, state = self._before_views.pop()
-            self.view_sampler.load_state_dict(state)
 
     def complete(self) -> None:
         """Make the whole state valid, before it is evaluated or saved. Raises `TrainingStopped` as `Engine.verify`."""
@@ -198,13 +212,13 @@ class TrainingState:
         if not 0 <= state["iteration"] <= self.iterations or state["nonfinite_losses"] < 0:
             raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
         self.iteration = state["iteration"]
-        self._before_views.clear()
         self.initial_error = state["initial_error"]
         self.nonfinite_losses.fill_(state["nonfinite_losses"])
-        self.begin_with(gaussians_of_state(state, self.device))
+        saved = read_gsplat({"splats": state["gaussians"]}, "the checkpoint")
+        self.begin_with(saved.map(lambda value: value.float().to(self.device)))
         if self.exposures is not None:
             self.exposures.load_state_dict(state["exposures"])
         if self.parameter_mean is not None:
-            self.parameter_mean.load_state_dict(state["parameter_mean"], self.learnt())
+            self.parameter_mean.load_state_dict(state["parameter_mean"], self.device)
         for name in STATEFUL:
             getattr(self, name).load_state_dict(state[name])

@@ -16,9 +16,8 @@ from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.scene import Frame, Scene
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
-from turbogs_plugin.train.given_model import read_given
 from turbogs_plugin.train.inputs import resolve_device
-from turbogs_plugin.train.saved_model import SavedModel, load_with_capture
+from turbogs_plugin.train.saved_model import SavedModel, load_with_capture, read_given
 from turbogs_plugin.types import Gaussians, Step
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.frames import Frames
