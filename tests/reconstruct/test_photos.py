@@ -22,10 +22,10 @@ def picture(seed: int = 0, size: tuple[int, int] = (48, 32)) -> Image.Image:
     return Image.fromarray(blocks.repeat(16, axis=0).repeat(16, axis=1))
 
 
-def jpeg() -> bytes:
+def stored(form: str = "JPEG") -> bytes:
     """A photo's file."""
     file = io.BytesIO()
-    picture().save(file, "JPEG", quality=95)
+    picture().save(file, form)
     return file.getvalue()
 
 
@@ -145,7 +145,8 @@ def test_names_have_no_spaces_and_folders_are_kept(tmp_path):
     [
         ({}, "has 0 photos: at least 3"),
         ({"IMG_1.HEIC": b"x"}, r"has 0 photos \(1 file is of a kind that is not read \(IMG_1.HEIC\)"),
-        ({"3.jpg": jpeg()[:-200]}, "cannot read the photo .*3.jpg.*replace it"),
+        ({"3.jpg": stored()[:-200]}, "cannot read the photo .*3.jpg.*replace it"),
+        ({"5.jpg": stored("GIF")}, "5.jpg has GIF inside, .*: convert it to JPEG"),
         ({"5.png": Image.fromarray(np.zeros((32, 48), dtype=np.uint16))}, "5.png has more than 8 bits"),
         ({"a b.jpg": picture(), "a_b.jpg": picture()}, "2 photos .*'a_b.jpg' without spaces"),
     ],

@@ -89,7 +89,7 @@ def test_numbers_have_the_digits_that_a_reader_can_use(folder):
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"format": 2}, "results.json' is of format 2: this version of TurboGS reads format 3"),
+        ({"format": 2}, "results.json' is of format 2: this version reads format 3"),
         ({"cells": 3}, "results.json' does not hold results of a study"),
         ({"variants": {}}, "variants: at least one is needed"),
         ({"cells": [{"scene": "fox"}]}, "results.json' does not hold results of a study"),

@@ -20,14 +20,10 @@ if TYPE_CHECKING:
 LOCAL, PORT = "127.0.0.1", 8080
 """Where a viewer listens unless told otherwise: for this machine alone."""
 
-OVERRIDE = re.compile(r"\w+(\.\w+)+=.*", re.DOTALL)
-
 Device = Literal["auto", "cpu", "cuda"]
 
 Overrides = Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")]
 Count = Annotated[int | None, arg(metavar="N")]
-Time = Annotated[str | None, arg(metavar="20s")]
-Decibels = Annotated[tuple[float, ...], arg(metavar="DB ...")]
 Scene = Annotated[Path | None, arg(metavar="SCENE")]
 RunOrModel = Annotated[Positional[Path], arg(metavar="RUN|MODEL")]
 
@@ -53,7 +49,7 @@ class RunOptions:
     device: Annotated[Device | None, arg(metavar="auto|cpu|cuda")] = None
     max_gaussians: Count = None
     max_memory: Annotated[str | None, arg(metavar="2GiB")] = None
-    time_budget: Time = None
+    time_budget: Annotated[str | None, arg(metavar="20s")] = None
     init: Annotated[str | None, arg(metavar="points|random|MODEL")] = None
 
     def settings(self, scene: Path | None, overrides: tuple[str, ...]) -> Config:
@@ -113,7 +109,7 @@ NO_SCENE = GivenOptions()
 
 def is_change(scene: Path) -> bool:
     """Whether the word in the place of a capture is a change of the configuration."""
-    return OVERRIDE.fullmatch(str(scene)) is not None and not scene.exists()
+    return re.fullmatch(r"\w+(\.\w+)+=.*", str(scene), re.DOTALL) is not None and not scene.exists()
 
 
 def require_positive(option: str, values: Sequence[float]) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from turbogs_plugin.commands.options import Count, Decibels, Device, require_positive
+from turbogs_plugin.commands.options import Count, Device, require_positive
 from turbogs_plugin.errors import InputError
 
 
@@ -59,7 +59,7 @@ def report(
     /,
     *,
     out: Path | None = None,
-    psnr: Decibels = (),
+    psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
 ) -> int:
     """Write the reports of studies again, from their results.json; or a report of runs side by side, where runs that
     were asked the same, but for the seed, count as one variant.

@@ -112,5 +112,4 @@ def _contracted(count: int, pairs: np.ndarray, weights: np.ndarray) -> list[list
             links[node][third] = links[third][node] = total
             heapq.heappush(heap, (-total, min(node, third), max(node, third)))
         links[other] = {}
-    groups = [sorted(group) for group in members if group]
-    return sorted(groups, key=lambda group: (-len(group), group))
+    return sorted((sorted(group) for group in members if group), key=lambda group: (-len(group), group))

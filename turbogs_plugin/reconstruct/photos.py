@@ -183,11 +183,7 @@ def _write_upright(source: Path, target: Path) -> None:
         upright = ImageOps.exif_transpose(image)
     for tag in set(exif).difference(KEPT_EXIF):  # a TIFF's say how its pixels are stored
         del exif[tag]
-    known: dict[str, dict[str, Any]] = {
-        "JPEG": {"quality": JPEG_QUALITY, "subsampling": 0},
-        "TIFF": {"compression": "raw"},
-    }
-    options = known.get(form or "", {})
+    options: dict[str, Any] = {"quality": JPEG_QUALITY, "subsampling": 0} if form == "JPEG" else {}
     if "icc_profile" in upright.info:
         options["icc_profile"] = upright.info["icc_profile"]
     try:

@@ -31,11 +31,6 @@ ENOUGH_OF_MANY = 0.95
 """Share of more than `FEW` photos that is enough; of fewer, all must register, or more features are looked for."""
 SMALLEST_SHARE = 0.5
 """A model with a smaller share of the photos is not taken for the scene."""
-NAMED_AT_MOST = 10
-REMEDY = (
-    "take sharp photos that overlap by two thirds with their neighbours, of one scene, from different places, not by "
-    "turning in one place"
-)
 
 
 @dataclass(frozen=True)
@@ -164,7 +159,9 @@ def _begin(photos: Sequence[PhotoFile], out: Path) -> bool:
 def _read_solution(out: Path) -> Solution | None:
     """What an earlier call came to; None where none was finished."""
     text = read_text(out / "reconstruction" / "solution.json")
-    return Solution(out, **json.loads(text)) if text and (out / "sparse" / "0").is_dir() else None
+    if not text or not (out / "sparse" / "0").is_dir():
+        return None
+    return Solution(**json.loads(text) | {"scene": out})  # which may have been moved
 
 
 def _reconstruct(photos: Sequence[PhotoFile], out: Path, others: str) -> Solution:
@@ -188,7 +185,10 @@ def _reconstruct(photos: Sequence[PhotoFile], out: Path, others: str) -> Solutio
             break
     if best is None or best.placed < max(FEWEST_PHOTOS, SMALLEST_SHARE * len(photos)):
         placed = best.placed if best else 0
-        raise InputError(f"cameras were found for only {placed} of {len(photos)} photos: {REMEDY}")
+        raise InputError(
+            f"cameras were found for only {placed} of {len(photos)} photos: take sharp photos that overlap by two "
+            "thirds with their neighbours, of one scene, from different places, not by turning in one place"
+        )
     model, ghosts = best.model, set(best.ghosts)
     for frame in {image.frame_id for image in model.images.values() if image.name in ghosts}:
         model.deregister_frame(frame)
@@ -202,8 +202,7 @@ def _reconstruct(photos: Sequence[PhotoFile], out: Path, others: str) -> Solutio
     model.write_binary(scratch / "sparse" / "0")
     (scratch / "sparse").rename(out / "sparse")  # whole or not at all
     result = Solution(out, len(photos), len(registered), model.num_points3D(), left_out, notes)
-    kept = {name: value for name, value in asdict(result).items() if name != "scene"}  # which may be moved
-    write_text_atomically(scratch / "solution.json", json.dumps(kept, indent=1))
+    write_text_atomically(scratch / "solution.json", json.dumps(asdict(result), indent=1, default=str))
     return result
 
 
@@ -246,7 +245,5 @@ def _notes(solve: Solve, photos: int, moved: list[str], left_out: list[str]) -> 
         (unplaced, "did not register: add photos between them and the others"),
     ):
         if names:
-            notes.append(
-                f"{len(names)} {'photo' if len(names) == 1 else 'photos'} {said}: {named(names, most=NAMED_AT_MOST)}"
-            )
+            notes.append(f"{len(names)} {'photo' if len(names) == 1 else 'photos'} {said}: {named(names, most=10)}")
     return notes

@@ -241,8 +241,7 @@ def _parsed(path: Path) -> Study:
         raise InputError(f"cannot read '{path}': {error}") from None
     try:
         if document["format"] != FORMAT:
-            said = f"'{path}' is of format {document['format']}: this version of TurboGS reads format {FORMAT}"
-            raise InputError(said)
+            raise InputError(f"'{path}' is of format {document['format']}: this version reads format {FORMAT}")
         ablation = Ablation(**{entry.name: document[entry.name] for entry in fields(Ablation)})
         provenances = [entry and Provenance(**entry) for entry in document["provenances"]]
         results = [_result(entry, document["settings"], provenances) for entry in document["cells"]]
