@@ -182,7 +182,7 @@ class TurboDensityStrategy(DefaultStrategy):
     def _accumulate(self, state: dict[str, Any], info: dict[str, Any], count: int) -> GaussianStats:
         """Add this iteration's statistics to those in `state`; returns the latter."""
         if state is None:
-            raise InputError("the strategy was called without its state: pass the dict from strategy.initialize_state()")
+            raise InputError("the strategy was called without its state: pass the dict of strategy.initialize_state()")
         require_keys(state, _STATE_KEYS, "the state", "expected the dict from TurboDensityStrategy.initialize_state()")
         stats, has_errors = iteration_stats(info, count)
         if self.choose_by == "squares" and info.get(STATISTICS) is None:
