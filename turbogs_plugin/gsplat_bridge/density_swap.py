@@ -110,7 +110,7 @@ class TurboDensityStrategy(DefaultStrategy):
         require(not self.revised_opacity, "revised_opacity", self.revised_opacity, "False: splits copy the opacity")
         pause, key = self.pause_refine_after_reset, self.key_for_gradient
         require(pause == 0, "pause_refine_after_reset", pause, "0: opacities are never reset")
-        require(key == "means2d", "key_for_gradient", key, "'means2d': the error sums are those of 3D Gaussians")
+        require(key == "means2d", "key_for_gradient", key, "'means2d': error sums are of 3D Gaussians")
         self._controller(0)  # checks the rest
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
@@ -182,8 +182,8 @@ class TurboDensityStrategy(DefaultStrategy):
     def _accumulate(self, state: dict[str, Any], info: dict[str, Any], count: int) -> GaussianStats:
         """Add this iteration's statistics to those in `state`; returns the latter."""
         if state is None:
-            raise InputError("the strategy was called without its state: expected that of strategy.initialize_state()")
-        require_keys(state, _STATE_KEYS, "the state", "expected that of TurboDensityStrategy.initialize_state()")
+            raise InputError("the strategy was called without its state: pass the dict of strategy.initialize_state()")
+        require_keys(state, _STATE_KEYS, "the state", "expected the dict from TurboDensityStrategy.initialize_state()")
         stats, has_errors = iteration_stats(info, count)
         if self.choose_by == "squares" and info.get(STATISTICS) is None:
             raise InputError(

@@ -6,8 +6,8 @@ Three sources, best first:
 2. gsplat's rasterizer, and prediction and ground truth in `info`: the *zero channel*. Colour channels that are zero
    everywhere, with the pixel error as their upstream gradient, have the sum of e * w as the gradient of their values,
    w = T * alpha the compositing weight; with 1 upstream, the sum of w. No other gradient is touched. The zero channel
-   costs one further pass over the tiles, of three channels: gsplat may be built for chosen numbers of them, and always
-   has that of a colour. The distance sums stay zero: no upstream gradient gives them.
+   costs one further pass over the tiles, of three channels: gsplat may be built for chosen numbers of channels, and
+   always has a colour's. The distance sums stay zero: no upstream gradient gives them.
 3. Neither: there is no error, only the gradient on the screen.
 """
 
