@@ -35,6 +35,9 @@ class Frames:
         send: encodes a picture [H, W, 3] uint8, without loss or not, and sends it.
         wish: gives the picture and the view that the pages show.
         clock: seconds.
+
+    Attributes:
+        about: a line about the last frame.
     """
 
     def __init__(
@@ -45,7 +48,7 @@ class Frames:
     ) -> None:
         self.send, self.wish, self.clock = send, wish, clock
         self.camera: ViewerCamera | None = None
-        self.next_at = -math.inf
+        self.about, self.next_at = "", -math.inf
         self._moved_at = self._sent_at = -math.inf
         self._sent: tuple | None = None
         self._per_pixel: float | None = None  # seconds, of pictures by the free camera
@@ -79,7 +82,8 @@ class Frames:
             camera = self._sized(camera, moving, running)
         shown, begun = state(), self.clock()
         with suppress(torch.cuda.OutOfMemoryError):  # the training has what it needs; a page can wait
-            self.send(draw(shown, picture, camera, view), not (moving or running))
+            pixels, self.about = draw(shown, picture, camera, view)
+            self.send(pixels, not (moving or running))
         seconds = self.clock() - begun
         self.next_at = begun + seconds / SHARE
         if not picture.of_view:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.train.history import Evaluation
@@ -19,9 +18,6 @@ from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
 from turbogs_plugin.viewer.pictures import CaptureViews, DensityChange, ModelState
 from turbogs_plugin.viewer.server import POLL_SECONDS, Page, serve_until_interrupted
-
-STATUS_SECONDS = 0.5
-"""Seconds between two updates of the page's text."""
 
 
 class LiveViewer(Listener):
@@ -38,8 +34,6 @@ class LiveViewer(Listener):
         self._samples: PixelSamples | None = None
         self._change: DensityChange | None = None
         self._psnr = math.nan
-        self._next_status = -math.inf
-        self._began, self._began_at = time.perf_counter(), 0
 
     def watch(self, session: RunSession) -> LiveViewer:
         """Take a run that is about to begin; itself, as a listener of its loop. The page's address is printed."""
@@ -49,9 +43,6 @@ class LiveViewer(Listener):
         self._capture = CaptureViews(self.trainer.views, session.test)
         self.page.show_capture(self._capture)
         return self
-
-    def begun(self, loop: TrainingLoop) -> None:
-        self._began, self._began_at = time.perf_counter(), loop.trainer.iteration
 
     def advanced(self, loop: TrainingLoop) -> None:
         if self.page.paused:
@@ -77,26 +68,22 @@ class LiveViewer(Listener):
 
     def _hold(self, loop: TrainingLoop) -> None:
         """Wait until the page asks for an iteration or lets the training go on, or the training is to be stopped."""
-        self._next_status = -math.inf  # told at once
         with loop.clock.stopped():
             while self.page.paused and not loop.stopped:
                 drawn = self._serve(loop.trainer, running=False)
                 if self.page.steps.acquire(timeout=0.0 if drawn else POLL_SECONDS):
                     break
-        self.begun(loop)
 
     def _serve(self, trainer: Trainer, running: bool) -> bool:
-        """Draw a frame if one is due, and keep the page's text up to date."""
+        """Draw a frame if one is due, and say what it shows."""
 
         def state() -> ModelState:
             synchronize(trainer.device)  # waiting for the iterations before is no cost of a frame
             return self._state(trainer)
 
         drawn = self.page.frames.serve(state, trainer.iteration, running)
-        now = time.perf_counter()
-        if self.page.watched and now >= self._next_status:
-            self._next_status = now + STATUS_SECONDS
-            self.page.say(self._status(trainer, running, now), self._state(trainer))
+        if drawn:
+            self.page.say(self._status(trainer, running))
         return drawn
 
     def _state(self, trainer: Trainer) -> ModelState:
@@ -104,17 +91,13 @@ class LiveViewer(Listener):
             gaussians=trainer.gaussians,
             look=Look(trainer.sh_degree, trainer.config.raster, trainer.background.evaluated),
             capture=self._capture,
-            maps=trainer.maps,
-            step=trainer.now,
+            maps=(trainer.maps, trainer.now),
             samples=self._samples,
             change=self._change,
         )
 
-    def _status(self, trainer: Trainer, running: bool, now: float) -> str:
-        speed = "paused" if self.page.paused else "finished"
-        if running:
-            speed = f"{(trainer.iteration - self._began_at) / max(now - self._began, 1e-9):.0f} a second"
-            self._began, self._began_at = now, trainer.iteration
+    def _status(self, trainer: Trainer, running: bool) -> str:
+        doing = "" if running else " (paused)" if self.page.paused else " (finished)"
         psnr = "" if math.isnan(self._psnr) else f" · test PSNR {self._psnr:.2f} dB"
-        line = f"iteration **{trainer.iteration}** of {trainer.iterations} ({speed})"
+        line = f"iteration **{trainer.iteration}** of {trainer.iterations}{doing}"
         return f"{line} · {len(trainer.gaussians):,} Gaussians{psnr}"

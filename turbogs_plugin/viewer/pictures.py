@@ -6,7 +6,6 @@ the capture, fitted into the page, whatever the free camera does.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -45,16 +44,6 @@ class Picture(str, Enum):
     def of_view(self) -> bool:
         """Whether it shows a view of the capture, not what the free camera sees."""
         return self not in (Picture.RENDER, Picture.CHANGES)
-
-
-EXPLANATIONS = {
-    Picture.RENDER: "The model from where you are.",
-    Picture.CHANGES: "**Green**: Gaussians that the last event of density control added. **Red**: those it removed.",
-    Picture.COMPARE: "A view of the capture: photo, render, and error (bright is wrong).",
-    Picture.ERRORS: "Mean of each pixel's last errors. Bright pixels are sampled more often.",
-    Picture.AGES: "Iterations since each pixel was sampled. Black: just now. Bright: long ago, so soon again.",
-    Picture.SAMPLES: "**Orange**: the pixels that this iteration renders and learns from.",
-}
 
 
 @dataclass(frozen=True)
@@ -110,8 +99,7 @@ class ModelState:
         gaussians: the model, on the device that renders.
         look: how it is shown, without exposures.
         capture: its views, for training and for testing.
-        maps: errors and ages of the training views.
-        step: the time from which ages count.
+        maps: errors and ages of the training views, and the time from which ages count.
         samples: pixels of the last iteration.
         change: the last event of density control.
     """
@@ -119,44 +107,33 @@ class ModelState:
     gaussians: Gaussians
     look: Look
     capture: CaptureViews | None = None
-    maps: ErrorMaps | None = None
-    step: Step | None = None
+    maps: tuple[ErrorMaps, Step] | None = None
     samples: PixelSamples | None = None
     change: DensityChange | None = None
 
 
+class AbsentError(Exception):
+    """A model's state lacks what a picture shows; the message says why, for the page."""
+
+
 @torch.no_grad()
-def draw(state: ModelState, picture: Picture, camera: ViewerCamera, view: int = 0) -> np.ndarray:
-    """A picture, [H, W, 3] uint8; empty if it cannot be drawn (`missing`).
+def draw(state: ModelState, picture: Picture, camera: ViewerCamera, view: int = 0) -> tuple[np.ndarray, str]:
+    """A picture, [H, W, 3] uint8, and a line about it: which view it shows, or why it is empty.
 
     Args:
         camera: the page's camera; its size is the picture's.
         view: number of a view of the capture, see `CaptureViews`; taken within its bounds.
     """
-    if missing(state, picture, view):
-        return np.full((camera.height, camera.width, 3), BACKGROUND, dtype=np.uint8)
-    if picture is Picture.RENDER:
-        return _render(state, camera)
-    if picture is Picture.CHANGES:
-        return _changes(state, camera)
-    number = shown_view(state, picture, view)
-    return _centred(DRAWN_BY[picture](state, camera, number), camera)
-
-
-def missing(state: ModelState, picture: Picture, view: int) -> str:
-    """Why a picture cannot be drawn, in a sentence for the page; empty if it can."""
-    if picture is Picture.CHANGES and (state.change is None or len(state.change.fresh) != len(state.gaussians)):
-        return "No change yet: wait for the next event of density control of a running training."
-    if picture.of_view and state.capture is None:
-        return "This model came without its capture: name it by --scene."
-    if picture in (Picture.ERRORS, Picture.AGES):
-        if state.maps is None or state.step is None:
-            return "Only a training keeps error maps."
-        if shown_view(state, picture, view) >= len(_capture(state).train):
-            return "This is a test view: error maps are kept of training views alone."
-    if picture is Picture.SAMPLES and state.samples is None:
-        return "No samples yet: they are drawn by a running training."
-    return ""
+    try:
+        if picture is Picture.RENDER:
+            return _render(state, camera), ""
+        if picture is Picture.CHANGES:
+            return _changes(state, camera), "Green: added by the last event of density control. Red: removed."
+        number = shown_view(state, picture, view)
+        draw_view = {Picture.COMPARE: _compare, Picture.SAMPLES: _samples, Picture.AGES: _ages}.get(picture, _errors)
+        return _centred(draw_view(state, camera, number), camera), _capture(state).name(number)
+    except AbsentError as reason:
+        return np.full((camera.height, camera.width, 3), BACKGROUND, dtype=np.uint8), str(reason)
 
 
 def shown_view(state: ModelState, picture: Picture, view: int) -> int:
@@ -176,7 +153,8 @@ def _render(state: ModelState, camera: ViewerCamera) -> np.ndarray:
 def _changes(state: ModelState, camera: ViewerCamera) -> np.ndarray:
     """The model in grey, with what was added in green; and in red what was removed, where it was."""
     model, change = state.gaussians, state.change
-    assert change is not None, "`missing` says so"
+    if change is None or len(change.fresh) != len(model):
+        raise AbsentError("No change yet: wait for the next event of density control of a running training.")
     colors = (SH_C0 * model.sh0[:, 0] + 0.5).clamp(0.0, 1.0).mean(dim=1, keepdim=True) * DIMMED
     colors = torch.where(change.fresh[:, None], colors.new_tensor(ADDED), colors.expand(-1, 3))
     colors = torch.cat([colors, colors.new_tensor(REMOVED).expand(len(change.removed), 3)])
@@ -198,23 +176,23 @@ def _compare(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
 
 def _errors(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
     """The map's own values: a mean over the last visits of each pixel, not the error of the present model."""
-    maps, _ = _maps(state)
-    shares = maps.view_errors(number) / (3.0 * ERROR_FULL_SCALE)
-    return _map_picture(shares, maps.sizes[number], camera)
+    maps, _ = _maps(state, number)
+    return _map_picture(maps.view_errors(number) / (3.0 * ERROR_FULL_SCALE), maps.sizes[number], camera)
 
 
 def _ages(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
     """Black: sampled just now. The brightest: as long ago as the oldest pixel of the view, on a logarithmic scale."""
-    maps, step = _maps(state)
+    maps, step = _maps(state, number)
     ages = torch.log1p(maps.ages(number, step).float())
     return _map_picture(ages / ages.max().clamp(min=1e-6), maps.sizes[number], camera)
 
 
 def _samples(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
     """The photo, dimmed, with the sampled pixels bright, also those that fall between the page's pixels."""
-    views, view_id = _capture(state).find(number)
-    samples, photo = state.samples, _photo(state, views, view_id)
-    assert samples is not None, "`missing` says so"
+    samples = state.samples
+    if samples is None:
+        raise AbsentError("No samples yet: they are drawn by a running training.")
+    photo = _photo(state, *_capture(state).find(number))
     sampled = torch.zeros_like(photo[..., 0])  # [H, W]
     chosen = samples.view_of_slot() == samples.view_ids.index(number)
     sampled.view(-1)[samples.pixel_ids[chosen & samples.filled].long()] = 1.0
@@ -223,23 +201,16 @@ def _samples(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
     return torch.where(mask[..., None], dimmed.new_tensor(SAMPLED), dimmed)
 
 
-DRAWN_BY: dict[Picture, Callable[[ModelState, ViewerCamera, int], Tensor]] = {
-    Picture.COMPARE: _compare,
-    Picture.ERRORS: _errors,
-    Picture.AGES: _ages,
-    Picture.SAMPLES: _samples,
-}
-"""Pictures of a view of the capture, [h, w, 3] uint8, no larger than the page's camera."""
-
-
 def _capture(state: ModelState) -> CaptureViews:
-    assert state.capture is not None, "`missing` says so"
+    if state.capture is None:
+        raise AbsentError("This model came without its capture: name it by --scene.")
     return state.capture
 
 
-def _maps(state: ModelState) -> tuple[ErrorMaps, Step]:
-    assert state.maps is not None and state.step is not None, "`missing` says so"
-    return state.maps, state.step
+def _maps(state: ModelState, number: int) -> tuple[ErrorMaps, Step]:
+    if state.maps is None or number >= len(_capture(state).train):
+        raise AbsentError("A running training keeps error maps, of its training views.")
+    return state.maps
 
 
 def _photo(state: ModelState, views: PosedImages, view_id: int) -> Tensor:

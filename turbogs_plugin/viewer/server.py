@@ -12,6 +12,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import urlsplit
 
@@ -21,7 +22,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.frames import Frames
-from turbogs_plugin.viewer.pictures import EXPLANATIONS, CaptureViews, ModelState, Picture, missing, shown_view
+from turbogs_plugin.viewer.pictures import CaptureViews, Picture
 
 if TYPE_CHECKING:
     import viser
@@ -93,7 +94,22 @@ class Page:
         host = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
         self.url = f"http://{host}:{self.server.get_port()}"
         self._frusta = self.server.scene.add_frame("/views", show_axes=False, visible=False)
-        self._build_panel(training)
+        gui: Any = self.server.gui  # its handles' values cannot be set, says its type
+        self._status = gui.add_markdown("Photos are being read, and error maps made.")
+        names = [picture.value for picture in Picture]
+        self._pictures = gui.add_dropdown("Picture", names, initial_value=names[0])
+        self._slider = gui.add_slider("View", 0, 1, 1, 0, visible=False)
+        self._there = gui.add_button("Stand at this view", visible=False)
+        self._cameras = gui.add_checkbox("Cameras of the capture", False, visible=False)
+        self._training = gui.add_folder("Training", visible=training)
+        with self._training:
+            self._pause = gui.add_button("Pause")
+            self._step = gui.add_button("One step")
+        self._pictures.on_update(lambda _: self._refresh())
+        self._there.on_click(lambda _: self.go_to(self._slider.value))
+        self._cameras.on_update(lambda _: self._refresh())
+        self._pause.on_click(lambda _: self.pause(not self.paused))
+        self._step.on_click(lambda _: self.step())
         self.pause(False)
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(self._disconnected)
@@ -141,7 +157,7 @@ class Page:
                 wxyz=camera.wxyz,
                 position=camera.position,
             )
-            frustum.on_click(lambda _, number=number: self.go_to(number))
+            frustum.on_click(partial(self.go_to, number))
 
     def stand_at(self, camera: ViewerCamera) -> None:
         """Move all clients, those who come later too, to a camera; they turn about a point one unit before it."""
@@ -155,16 +171,12 @@ class Page:
                 client.camera.position, client.camera.wxyz = place, np.array(camera.wxyz)
                 client.camera.fov = camera.fov
 
-    def say(self, line: str, state: ModelState) -> None:
-        """Show a line of Markdown; below it the name of the view that is shown, or why nothing is."""
-        picture, view = self.wish()
-        about = missing(state, picture, view)
-        if not about and picture.of_view and self.capture is not None:
-            about = quoted(self.capture.name(shown_view(state, picture, view)))
-        if self._status.content != (text := f"{line}\n\n{about}"):
-            self._status.content = text
+    def say(self, line: str) -> None:
+        """Show a line of Markdown, and below it the line about the last frame."""
+        about = self.frames.about
+        self._status.content = f"{line}\n\n{quoted(about) if about else ''}"
 
-    def go_to(self, number: int) -> None:
+    def go_to(self, number: int, event: object = None) -> None:
         """Choose a view, and bring every client's camera there."""
         if self.capture is not None:
             self._slider.value = number = min(max(0, number), len(self.capture) - 1)
@@ -179,30 +191,9 @@ class Page:
         """Turn everybody away."""
         stop(self.server)
 
-    def _build_panel(self, training: bool) -> None:
-        gui: Any = self.server.gui  # its handles' values cannot be set, says its type
-        self._status = gui.add_markdown("Photos are being read, and error maps made.")
-        names = [picture.value for picture in Picture]
-        self._pictures = gui.add_dropdown("Picture", names, initial_value=names[0])
-        self._about = gui.add_markdown(EXPLANATIONS[Picture.RENDER])
-        self._slider = gui.add_slider("View", 0, 1, 1, 0, visible=False)
-        self._there = gui.add_button("Stand at this view", visible=False)
-        self._cameras = gui.add_checkbox("Cameras of the capture", False, visible=False)
-        self._training = gui.add_folder("Training", visible=training)
-        with self._training:
-            self._pause = gui.add_button("Pause")
-            self._step = gui.add_button("One step")
-        self._pictures.on_update(lambda _: self._refresh())
-        self._there.on_click(lambda _: self.go_to(self._slider.value))
-        self._cameras.on_update(lambda _: self._refresh())
-        self._pause.on_click(lambda _: self.pause(not self.paused))
-        self._step.on_click(lambda _: self.step())
-
     def _refresh(self) -> None:
-        """Explain the picture, and show the cameras of the capture where they are asked for and can be seen."""
-        picture, _ = self.wish()
-        self._about.content = EXPLANATIONS[picture]
-        self._frusta.visible = bool(self._cameras.value) and not picture.of_view
+        """Show the cameras of the capture where they are asked for and can be seen."""
+        self._frusta.visible = bool(self._cameras.value) and not self.wish()[0].of_view
 
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(self._looked)

@@ -47,8 +47,10 @@ def server_of(state: ModelState, title: str, page: Page) -> Callable[[], bool]:
         page.server.scene.set_up_direction("-y")
 
     def serve() -> bool:
-        page.say(line, state)
-        return page.frames.serve(lambda: state, 0, running=False)
+        drawn = page.frames.serve(lambda: state, 0, running=False)
+        if drawn:
+            page.say(line)
+        return drawn
 
     return serve
 
