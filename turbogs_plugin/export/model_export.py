@@ -24,15 +24,13 @@ from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.train.inputs import resolve_device
 from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.metrics import psnr, render_view
-from turbogs_plugin.train.saved_model import SavedModel, load_with_capture
+from turbogs_plugin.train.saved_model import load_with_capture
 from turbogs_plugin.types import Cameras, Gaussians
 
 PAGE = "html"
 """Name of the page with the model to turn, which no program reads back."""
 MOST_ON_PAGE = 800_000
 """Largest model of a page: 36 bytes a Gaussian make about 30 MB, which mail and chat programs take."""
-
-
 MOST_VIEWS = 8
 """Test views that are measured, evenly spread: each is rendered once more for the file's model."""
 
@@ -42,15 +40,15 @@ def export_run(
 ) -> str:
     """Write a run's newest model or a given one, and compare what was written with it.
 
-    Returns:
-        Three lines for the user: the file, sizes, and PSNR before and after.
-
     Args:
         path: folder of the run, or the file of a model.
         file_format: one of `FORMATS`, or `PAGE`.
         out: new file; None: beside the model in the run's folder.
         max_gaussians: largest number of Gaussians to keep, those that add most to the training views; None: all.
         given: the capture of a model from a file, and how to render it; None: `path` is a run.
+
+    Returns:
+        Three lines for the user: the file, sizes, and PSNR before and after.
 
     Raises:
         InputError: an option does not fit, no such model, or no usable capture where it is needed.
@@ -59,7 +57,10 @@ def export_run(
     is_page = file_format == PAGE
     needed = max_gaussians is not None or is_page
     model, scene, absent = load_with_capture(path, given, resolve_device("auto"), needed)
-    file = out or _beside(model, f".{PAGE}" if is_page else FORMATS[file_format].suffix)
+    file = out
+    if file is None:
+        assert model.folder is not None, "only a run is exported without --out"
+        file = model.folder.model.with_suffix(f".{PAGE}" if is_page else FORMATS[file_format].suffix)
     if is_page:
         max_gaussians = min(max_gaussians or MOST_ON_PAGE, MOST_ON_PAGE)
     kept, whole = model.gaussians, model.gaussians
@@ -70,7 +71,9 @@ def export_run(
     if is_page and scene is not None:
         written = page_gaussians(kept, scene.train.cameras, model.sh_degree)
     else:
-        notes += _blur_note(model.config.raster.eps2d)
+        eps2d, usual = model.config.raster.eps2d, DEFAULT_SETTINGS.eps2d
+        if eps2d != usual:
+            notes += (f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}",)
         FORMATS[file_format].write(kept, file, model.frame, model.iteration or 0)
         written = Similarity.into(model.frame).apply(FORMATS[file_format].read(file)).map(torch.Tensor.float)
     lost = f"not measured: {absent or 'the capture has no test views'}"
@@ -126,17 +129,6 @@ def _require_options(
         raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
     elif max_gaussians is not None and file_format == "ply":
         raise InputError("--max-gaussians would replace the run's own model.ply: name a new file by --out")
-
-
-def _beside(model: SavedModel, suffix: str) -> Path:
-    assert model.folder is not None, "only a run is exported without --out"
-    return model.folder.model.with_suffix(suffix)
-
-
-def _blur_note(eps2d: float) -> tuple[str, ...]:
-    """The blur of the model's pixels, which no file holds, where other programs would not guess it."""
-    usual = DEFAULT_SETTINGS.eps2d
-    return () if eps2d == usual else (f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}",)
 
 
 @torch.no_grad()
