@@ -16,9 +16,7 @@ import torch
 from helpers.framework_runs import TINY, assert_identical
 from helpers.viewer_client import ViewerClient
 
-from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.model.formats import FORMATS
-from turbogs_plugin.report.images import to_uint8
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.live import LiveViewer
@@ -27,16 +25,6 @@ from turbogs_plugin.viewer.server import INSTALL, Page
 from turbogs_plugin.viewer.show import open_state
 
 pytest.importorskip("viser")
-
-
-def test_the_first_frames_are_our_renders(shown, state):
-    cameras = state.capture.train.cameras
-    for view in (0, 3, 6):
-        with shown(state) as page, ViewerClient(page.url) as client:
-            client.look(ViewerCamera.of_view(cameras, view))
-            frame = client.next_frame(lossless=True).pixels()
-        image = render_image(state.gaussians, cameras, view, **state.look.options)
-        assert np.abs(frame.astype(int) - to_uint8(image.colors)).max() <= 2
 
 
 def test_pictures_and_views_are_chosen_on_the_page_and_moving_frames_are_jpeg(shown, state):
@@ -187,12 +175,11 @@ def test_bad_input_is_one_line(turbogs, tmp_path, capture):
     assert not out.exists()
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_a_model_from_a_file_stands_before_the_camera(state, tmp_path, name):
+def test_a_model_from_a_file_stands_before_the_camera(state, tmp_path):
     far = state.gaussians.map(lambda value: value.clone())
     far.means = far.means * 50.0 + torch.tensor([1000.0, -2000.0, 500.0])
-    file = tmp_path / f"model{FORMATS[name].suffix}"
-    FORMATS[name].write(far, file, Frame(np.zeros(3), 1.0), 0)
+    file = tmp_path / "model.ply"
+    FORMATS["ply"].write(far, file, Frame(np.zeros(3), 1.0), 0)
     found = open_state(file, torch.device("cpu"))
     distances = found.gaussians.means.norm(dim=1)
     assert 0.45 < float((distances <= 1.01).float().mean()) < 0.55

@@ -1,7 +1,7 @@
 """The viewer of a training: a listener of its loop that draws frames between iterations, on their thread.
 
-It changes nothing that the training computes with, so the result stays bit for bit. While nobody looks it draws nothing
-and keeps nothing.
+Nothing that the training computes with changes, so the result stays bit for bit. While nobody looks, nothing is drawn
+or kept.
 """
 
 from __future__ import annotations
