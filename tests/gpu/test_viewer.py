@@ -8,13 +8,13 @@ from helpers.framework_runs import tiny_capture, tiny_config
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.engine.cuda import library as kernels
+from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.scene.offload import place_views
+from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.run import new_loop
-from turbogs_plugin.types import RowUpdate
 from turbogs_plugin.viewer.camera import ViewerCamera
-from turbogs_plugin.viewer.model_state import CaptureViews, DensityChange, ModelState
-from turbogs_plugin.viewer.pictures import Picture, Request, draw
+from turbogs_plugin.viewer.pictures import CaptureViews, DensityChange, ModelState, Picture, draw
 
 pytestmark = [
     pytest.mark.gpu,
@@ -32,7 +32,7 @@ class Watcher:
         self.samples = samples
 
     def changing(self, gaussians, update, step) -> None:
-        self.change = DensityChange.of(gaussians, update, step.iteration)
+        self.change = DensityChange.of(gaussians, update)
 
 
 @pytest.fixture(scope="module", params=["device", "host"])
@@ -48,12 +48,10 @@ def subjects(request, tmp_path_factory) -> tuple[ModelState, ModelState]:
     loop.run()
     synchronize(CUDA)
     views = CaptureViews(trainer.views, place_views(scene.test, CUDA, request.param))
-    here = ModelState(trainer.gaussians, trainer.sh_degree, capture=views, maps=trainer.maps, step=trainer.now)
-    here.samples, here.change = watcher.samples, watcher.change
-    there = ModelState(trainer.gaussians.map(torch.Tensor.cpu), trainer.sh_degree, capture=CaptureViews(*split(scene)))
-    change = watcher.change
-    update = RowUpdate(change.update.source.cpu(), change.update.fresh.cpu(), {})
-    there.change = DensityChange(change.iteration, update, change.removed.map(torch.Tensor.cpu))
+    change, look = watcher.change, Look(trainer.sh_degree, DEFAULT_SETTINGS)
+    here = ModelState(trainer.gaussians, look, views, (trainer.maps, trainer.now), watcher.samples, change)
+    there = ModelState(trainer.gaussians.map(torch.Tensor.cpu), look, CaptureViews(*split(scene)))
+    there.change = DensityChange(change.fresh.cpu(), change.removed.map(torch.Tensor.cpu))
     return here, there
 
 
@@ -65,8 +63,8 @@ def split(scene):
 def test_pictures_are_those_of_the_reference(subjects, picture):
     here, there = subjects
     for view in (0, 3, 6):
-        request = Request(picture, ViewerCamera.of_view(there.capture.train.cameras, view), view)
-        found, expected = (draw(subject, request).astype(int) for subject in (here, there))
+        camera = ViewerCamera.of_view(there.capture.train.cameras, view)
+        found, expected = (draw(subject, picture, camera, view)[0].astype(int) for subject in (here, there))
         assert found.std() > 5
         # A colour of the error's scale may jump with the last digit.
         differing = (np.abs(found - expected) > 2).mean()
@@ -76,6 +74,6 @@ def test_pictures_are_those_of_the_reference(subjects, picture):
 @pytest.mark.parametrize("picture", list(Picture))
 def test_every_picture_is_drawn(subjects, picture):
     here, there = subjects
-    eye = ViewerCamera.of_view(there.capture.train.cameras, 2)
-    found = draw(here, Request(picture, eye, 2))
-    assert found.shape == (eye.height, eye.width, 3) and found.std() > 1
+    camera = ViewerCamera.of_view(there.capture.train.cameras, 2)
+    found, _ = draw(here, picture, camera, 2)
+    assert found.shape == (camera.height, camera.width, 3) and found.std() > 1

@@ -1,11 +1,9 @@
-"""History, metrics, plots and the page."""
+"""Pictures, plots, tables, provenance and the page."""
 
-import json
 import math
 import re
 import subprocess
 from pathlib import Path
-from types import SimpleNamespace
 
 import matplotlib
 import numpy as np
@@ -14,92 +12,12 @@ import torch
 from helpers.framework_runs import tiny_capture, tiny_config
 from PIL import Image
 
-from turbogs_plugin.device import peak_memory_bytes
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.report import provenance
 from turbogs_plugin.report.curves import plot_against_seconds
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, GAP, depth_picture, error_picture, save_image, strip
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.report.tables import number, table
 from turbogs_plugin.train import run
-from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
-from turbogs_plugin.train.metrics import Metrics, ViewMetrics, compare, psnr, ssim
-from turbogs_plugin.train.progress import TrainingProgress
-
-FIELDS = {"iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians", "memory_bytes"}
-
-
-def evaluation(iteration: int = 10, **changes) -> Evaluation:
-    return Evaluation(iteration, 1.5, 20.0 + iteration / 100, 0.8, 0.05, 1000, 2**20, **changes)
-
-
-def test_a_line_has_every_field_and_reads_back(tmp_path):
-    path = tmp_path / "history.jsonl"
-    written = [evaluation(0), evaluation(10, nonfinite_losses=2)]
-    for line in written:
-        append_evaluation(path, line)
-    assert all(set(json.loads(line)) >= FIELDS for line in path.read_text().splitlines())
-    assert read_history(path) == written
-
-
-def test_the_worst_view_is_recorded():
-    views = [ViewMetrics("a", 31.0, 0.9, 0.01), ViewMetrics("b", 18.5, 0.7, 0.1), ViewMetrics("c", 33.0, 0.9, 0.01)]
-    assert Metrics(views, 10.0).worst_psnr == 18.5
-    assert math.isnan(Metrics([*views, ViewMetrics("d", math.nan, 0.9, 0.01)], 10.0).worst_psnr)
-
-
-def test_nan_is_null(tmp_path):
-    line = Evaluation(1, 1.0, 20.0, math.nan, 0.1, 1, 1)
-    append_evaluation(tmp_path / "h", line)
-    assert json.loads((tmp_path / "h").read_text())["ssim"] is None
-    assert math.isnan(read_history(tmp_path / "h")[0].ssim)
-
-
-def test_a_line_cut_short_is_left_out_and_a_wrong_one_is_named(tmp_path):
-    path = tmp_path / "history.jsonl"
-    append_evaluation(path, evaluation(1))
-    whole = path.read_text()
-    path.write_text(whole + whole[:20])
-    assert read_history(path) == [evaluation(1)]
-    path.write_text("nonsense\n" + whole)
-    with pytest.raises(InputError, match="line 1"):
-        read_history(path)
-
-
-def test_a_resumed_run_says_the_rest_again(tmp_path):
-    path = tmp_path / "history.jsonl"
-    for iteration in (0, 10, 20, 30):
-        append_evaluation(path, evaluation(iteration))
-    assert [line.iteration for line in rewind_history(path, 20)] == [0, 10, 20]
-    assert [line.iteration for line in read_history(path)] == [0, 10, 20]
-
-
-def test_errors_of_an_image_by_numpy():
-    generator = torch.Generator().manual_seed(0)
-    photo = torch.rand(24, 20, 3, generator=generator)
-    image = (photo + 0.1 * torch.randn(24, 20, 3, generator=generator)).clamp(0, 1)
-    metrics = compare("view", image, photo)
-    difference = image.double().numpy() - photo.double().numpy()
-    assert metrics.psnr == pytest.approx(-10 * np.log10((difference**2).mean()), abs=1e-4)
-    assert metrics.l1 == pytest.approx(np.abs(difference).mean(), abs=1e-6)
-
-
-@pytest.mark.parametrize("shape", [(11, 11), (24, 20), (40, 64)])
-def test_ssim_is_that_of_torchmetrics(shape):
-    torchmetrics = pytest.importorskip("torchmetrics.functional.image")
-    generator = torch.Generator().manual_seed(1)
-    photo = torch.rand(*shape, 3, generator=generator)
-    image = (photo + 0.2 * torch.randn(*shape, 3, generator=generator)).clamp(0, 1)
-    pair = [picture.permute(2, 0, 1)[None] for picture in (image, photo)]
-    expected = torchmetrics.structural_similarity_index_measure(*pair, data_range=1.0, kernel_size=11, sigma=1.5)
-    assert ssim(image, photo).item() == pytest.approx(expected.item(), abs=1e-6)
-
-
-def test_an_exact_image_and_a_small_one():
-    photo = torch.rand(12, 12, 3)
-    assert compare("view", photo, photo).psnr == 100.0
-    assert math.isnan(compare("view", photo[:8], photo[:8]).ssim)
-    assert math.isnan(psnr(torch.full_like(photo, math.nan), photo)), "what cannot be compared does not fit"
 
 
 def test_bytecode_that_is_missing_is_named_with_its_remedy(tmp_path, monkeypatch):
@@ -108,10 +26,6 @@ def test_bytecode_that_is_missing_is_named_with_its_remedy(tmp_path, monkeypatch
     assert f"-m compileall -q -j 0 {Path(torch.__file__).parents[1]}" in provenance.missing_bytecode()
     place.touch()
     assert provenance.missing_bytecode() == ""
-
-
-def test_memory_is_that_of_this_process():
-    assert 50 * 2**20 < peak_memory_bytes(torch.device("cpu")) < 2**40
 
 
 def test_a_strip_is_photo_render_and_error():
@@ -186,31 +100,6 @@ def test_tables():
     assert table(("a", "b"), [(1, 2)]).splitlines() == ["| a | b |", "| --- | --- |", "| 1 | 2 |"]
     assert table(("a",), [("left|right.png",)]).splitlines()[-1] == "| left\\|right.png |"
     assert number(1.23456, 2) == "1.23" and number(math.nan, 2) == "not computed"
-
-
-def training(iteration: int, gaussians: int) -> SimpleNamespace:
-    """What progress reads of a loop: the iteration, of 100, and the number of Gaussians."""
-    return SimpleNamespace(trainer=SimpleNamespace(iteration=iteration, iterations=100, gaussians=range(gaussians)))
-
-
-def test_progress_is_a_line_an_evaluation_where_there_is_no_terminal(capsys):
-    with TrainingProgress() as progress:
-        progress.advanced(training(1, 5))
-        progress.evaluated(training(10, 5), evaluation(10, skipped_updates=3))
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert "10/100" in lines[0] and "20.10 dB" in lines[0] and "3 skipped updates" in lines[0]
-
-
-def test_progress_is_a_bar_on_a_terminal(capsys, monkeypatch):
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setattr("turbogs_plugin.train.progress.REFRESH_SECONDS", 0.0)
-    with TrainingProgress() as progress:
-        progress.evaluated(training(10, 5), evaluation(10))
-        progress.advanced(training(50, 1234))
-    shown = capsys.readouterr().err
-    assert all(part in shown for part in ("50/100", "PSNR 20.10 dB", "1,234 Gaussians", "it/s"))
 
 
 @pytest.mark.parametrize("strips", [0, 1])

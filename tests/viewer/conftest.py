@@ -8,9 +8,11 @@ import pytest
 from helpers.framework_runs import tiny_capture, tiny_config
 
 from turbogs_plugin.captures import load_scene
+from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS
 from turbogs_plugin.plan import make_plan
+from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.run import new_loop
-from turbogs_plugin.viewer.model_state import CaptureViews, ModelState
+from turbogs_plugin.viewer.pictures import CaptureViews, ModelState
 
 
 @pytest.fixture(scope="session")
@@ -31,7 +33,7 @@ def new_training(capture, scene):
     def new_training(*overrides: str):
         config = tiny_config(capture, *overrides)
         device = scene.train.cameras.viewmats.device
-        return new_loop(make_plan(config, scene, device).apply(config), scene, device)[0]
+        return new_loop(make_plan(config, scene, device).apply(config), scene, device)
 
     return new_training
 
@@ -42,7 +44,8 @@ def untouched(new_training, scene):
     trainer = new_training().trainer
     trainer.initialise_maps()
     views = CaptureViews(trainer.views, scene.test)
-    return ModelState(trainer.gaussians, trainer.sh_degree, capture=views, maps=trainer.maps, step=trainer.now)
+    look = Look(trainer.sh_degree, DEFAULT_SETTINGS)
+    return ModelState(trainer.gaussians, look, capture=views, maps=(trainer.maps, trainer.now))
 
 
 @pytest.fixture
@@ -67,7 +70,7 @@ def shown():
             def serve() -> None:
                 while not over.is_set():
                     if not draw_due():
-                        page.controls.wait(0.05)
+                        over.wait(0.02)
 
             thread = threading.Thread(target=serve)
             thread.start()

@@ -1,16 +1,16 @@
 """The page in a real browser: frames arrive as they were drawn, and pictures switch."""
 
-import dataclasses
 import io
 import shutil
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from turbogs_plugin.viewer.camera import ViewerCamera
-from turbogs_plugin.viewer.pictures import Picture, Request, draw
+from turbogs_plugin.viewer.pictures import Picture, draw
 from turbogs_plugin.viewer.server import Page
 
 pytest.importorskip("viser")
@@ -74,18 +74,16 @@ def test_frames_arrive_as_they_were_drawn_and_pictures_switch(browser, shown, st
         tab = Tab(browser, page)
 
         def seen_from(view: int):
-            eye = ViewerCamera.of_view(state.capture.train.cameras, view)
-            return lambda width, height: draw(
-                state, Request(Picture.RENDER, dataclasses.replace(eye, width=width, height=height))
-            )
+            camera = ViewerCamera.of_view(state.capture.train.cameras, view)
+            return lambda width, height: draw(state, Picture.RENDER, replace(camera, width=width, height=height))[0]
 
         renders = [tab.comes_to_show(seen_from(0))]
         for view in (3, 6):
-            page.choose_view(view)
+            page._slider.value = view
             tab.press("Stand at this view")
             renders.append(tab.comes_to_show(seen_from(view)))
         assert all(image.std() > 5 for image in renders)
-        for picture in (Picture.DEPTH, Picture.COMPARE, Picture.ERRORS, Picture.RENDER):
+        for picture in (Picture.COMPARE, Picture.ERRORS, Picture.RENDER):
             tab.choose(picture)
             # A colour of a scale may jump with the last digit of a pose: so by the pose that the browser told.
-            tab.comes_to_show(lambda *size, picture=picture: draw(state, Request(picture, page.screens()[0].camera, 6)))
+            tab.comes_to_show(lambda *size, picture=picture: draw(state, picture, page.frames.camera, 6)[0])

@@ -132,5 +132,5 @@ def export(
         return 0
     from turbogs_plugin.export.model_export import export_run
 
-    print(f"model  {export_run(run, format, out, max_gaussians, given.settings(overrides)).text()}")
+    print(f"model  {export_run(run, format, out, max_gaussians, given.settings(overrides))}")
     return 0

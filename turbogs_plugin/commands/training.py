@@ -87,9 +87,11 @@ def train(
         if viewer is not None:
             if ranks.count > 1:
                 raise InputError(VIEWER_ON_ONE)  # started by torchrun
-            from turbogs_plugin.viewer.live import attached
+            from turbogs_plugin.viewer.live import LiveViewer
+            from turbogs_plugin.viewer.server import Page
 
-            live = pages.enter_context(attached(viewer[0] if viewer else PORT, viewer_host))
+            live = LiveViewer(Page(viewer_host, viewer[0] if viewer else PORT, training=True))
+            pages.callback(live.page.close)
             watch.append(live.watch)
         folder = resume or out
         assert folder is not None  # one of them is named

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -13,53 +15,29 @@ from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.export.fidelity import Change, measure_change
 from turbogs_plugin.export.html_page import html_page, page_gaussians
 from turbogs_plugin.files import require_new_file, write_text_atomically
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.similarity import Similarity
+from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.train.inputs import resolve_device
-from turbogs_plugin.train.saved_model import SavedModel, load_with_capture
+from turbogs_plugin.train.look import Look
+from turbogs_plugin.train.metrics import psnr, render_view
+from turbogs_plugin.train.saved_model import load_with_capture
 from turbogs_plugin.types import Cameras, Gaussians
 
 PAGE = "html"
 """Name of the page with the model to turn, which no program reads back."""
 MOST_ON_PAGE = 800_000
 """Largest model of a page: 36 bytes a Gaussian make about 30 MB, which mail and chat programs take."""
-
-
-@dataclass(frozen=True)
-class Exported:
-    """The file that was written, beside the model that it was made of.
-
-    Args:
-        file: the new file.
-        gaussians: number of Gaussians in it.
-        held_bytes, of: bytes of the model in float32, and number of its Gaussians.
-        change: what the model lost; None where that was not measured.
-        unmeasured: why; empty where it was.
-        notes: what was left out on purpose.
-    """
-
-    file: Path
-    gaussians: int
-    held_bytes: int
-    of: int
-    change: Change | None
-    unmeasured: str = ""
-    notes: tuple[str, ...] = ()
-
-    def text(self) -> str:
-        """Three lines: the file, sizes, and what was lost."""
-        notes = f" ({'; '.join(self.notes)})" if self.notes else ""
-        size = f"{self.held_bytes:,} bytes in float32 -> {self.file.stat().st_size:,} bytes in the file"
-        lost = f"PSNR   not measured: {self.unmeasured}" if self.change is None else self.change.text()
-        return f"{self.file}{notes}\nsize   {size}, {self.gaussians} of {self.of} Gaussians\n{lost}"
+MOST_VIEWS = 8
+"""Test views that are measured, evenly spread: each is rendered once more for the file's model."""
 
 
 def export_run(
     path: Path, file_format: str, out: Path | None, max_gaussians: int | None = None, given: Config | None = None
-) -> Exported:
+) -> str:
     """Write a run's newest model or a given one, and compare what was written with it.
 
     Args:
@@ -69,6 +47,9 @@ def export_run(
         max_gaussians: largest number of Gaussians to keep, those that add most to the training views; None: all.
         given: the capture of a model from a file, and how to render it; None: `path` is a run.
 
+    Returns:
+        Three lines for the user: the file, sizes, and PSNR before and after.
+
     Raises:
         InputError: an option does not fit, no such model, or no usable capture where it is needed.
     """
@@ -76,7 +57,10 @@ def export_run(
     is_page = file_format == PAGE
     needed = max_gaussians is not None or is_page
     model, scene, absent = load_with_capture(path, given, resolve_device("auto"), needed)
-    file = out or _beside(model, f".{PAGE}" if is_page else FORMATS[file_format].suffix)
+    file = out
+    if file is None:
+        assert model.folder is not None, "only a run is exported without --out"
+        file = model.folder.model.with_suffix(f".{PAGE}" if is_page else FORMATS[file_format].suffix)
     if is_page:
         max_gaussians = min(max_gaussians or MOST_ON_PAGE, MOST_ON_PAGE)
     kept, whole = model.gaussians, model.gaussians
@@ -87,21 +71,44 @@ def export_run(
     if is_page and scene is not None:
         written = page_gaussians(kept, scene.train.cameras, model.sh_degree)
     else:
-        notes += _blur_note(model.config.raster.eps2d)
+        eps2d, usual = model.config.raster.eps2d, DEFAULT_SETTINGS.eps2d
+        if eps2d != usual:
+            notes += (f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}",)
         FORMATS[file_format].write(kept, file, model.frame, model.iteration or 0)
         written = Similarity.into(model.frame).apply(FORMATS[file_format].read(file)).map(torch.Tensor.float)
-    change = None
+    lost = f"not measured: {absent or 'the capture has no test views'}"
+    caption = f"{len(written):,} Gaussians, one colour each"
     if scene is not None and len(scene.test):
-        change = measure_change(whole, written, scene.test, model.own_look(scene.test))
+        look, to_device = model.own_look(scene.test), partial(torch.Tensor.to, device=whole.device)
+        before, after = (mean_psnr(each, scene.test, look) for each in (whole, written.map(to_device)))
+        measured = f"on {min(MOST_VIEWS, len(scene.test))} of {len(scene.test)} test views"
+        lost = f"{before:.3f} -> {after:.3f} dB {measured}"
+        caption += f": PSNR {after:.2f} dB on test views, {before:.2f} dB in the trained model"
     if is_page and scene is not None:
-        caption = f"{len(written):,} Gaussians, one colour each"
-        if change is not None:
-            caption += f": PSNR {change.after:.2f} dB on test views, {change.before:.2f} dB in the trained model"
         background = model.own_look(scene.train).background
         write_text_atomically(file, html_page(written, scene.train.cameras, background, scene.name, caption))
     held = sum(value.numel() * 4 for _, value in whole.items())
-    reason = absent or "the capture has no test views"
-    return Exported(file, len(written), held, len(whole), change, reason, notes)
+    size = f"{held:,} bytes in float32 -> {file.stat().st_size:,} bytes in the file"
+    said = f" ({'; '.join(notes)})" if notes else ""
+    return f"{file}{said}\nsize   {size}, {len(written)} of {len(whole)} Gaussians\nPSNR   {lost}"
+
+
+@torch.no_grad()
+def mean_psnr(model: Gaussians, views: PosedImages, look: Look) -> float:
+    """Mean PSNR in dB of a model on at most `MOST_VIEWS` views, without masked pixels.
+
+    Args:
+        model: in the scene's frame, on the device that renders.
+        views: the test views, at least one, on any device.
+        look: how the model is shown; without exposures, as a file of a model holds none.
+    """
+    views, values = views.with_cameras_on(model.device), []
+    look = replace(look, sh_degree=min(look.sh_degree, model.sh_degree))
+    for view_id in evenly(len(views), MOST_VIEWS):
+        image = render_view(model, views, view_id, look)
+        photo, mask = views.photos.image(view_id, look.background).to(model.device), views.mask(view_id)
+        values.append(psnr(image, photo) if mask is None else psnr(image[mask], photo[mask]))
+    return fmean(values)
 
 
 def _require_options(
@@ -122,17 +129,6 @@ def _require_options(
         raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
     elif max_gaussians is not None and file_format == "ply":
         raise InputError("--max-gaussians would replace the run's own model.ply: name a new file by --out")
-
-
-def _beside(model: SavedModel, suffix: str) -> Path:
-    assert model.folder is not None, "only a run is exported without --out"
-    return model.folder.model.with_suffix(suffix)
-
-
-def _blur_note(eps2d: float) -> tuple[str, ...]:
-    """The blur of the model's pixels, which no file holds, where other programs would not guess it."""
-    usual = DEFAULT_SETTINGS.eps2d
-    return () if eps2d == usual else (f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}",)
 
 
 @torch.no_grad()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 import shlex
-import shutil
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,7 +43,7 @@ def write_refined(scene: Path, out: Path) -> str:
     """Write a COLMAP capture with the refined cameras and points of another: ``sparse/0``, and links to its photos.
 
     Points, colours, features and tracks stay, under their identifiers. Reduced copies of the photos (``images_2``, ...)
-    and masks beside them are linked, too; where a folder cannot be linked, it is copied.
+    and masks beside them are linked, too.
 
     Args:
         scene: folder of a COLMAP capture.
@@ -83,12 +82,14 @@ def write_refined(scene: Path, out: Path) -> str:
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".") as temporary:
         folder = Path(temporary) / "capture"
         (folder / MODEL / "0").mkdir(parents=True)
-        for name, source in _photo_folders(scene, capture).items():
-            try:
+        try:
+            for name, source in _photo_folders(scene, capture).items():
                 (folder / name).symlink_to(source.resolve(), target_is_directory=True)
-            except OSError:  # a disk without links
-                shutil.copytree(source, folder / name)
-        write_whole(_reconstruction(*found, capture, refined), folder / MODEL / "0", out)
+            write_whole(_reconstruction(*found, capture, refined), folder / MODEL / "0", out)
+        except OSError as error:
+            raise InputError(
+                f"--out '{out}' cannot be written: make room there, or choose a disk that takes links"
+            ) from error
         folder.rename(out)
     return "\n".join([*capture.notes[1:], refined.text("cameras"), f"scene  {out}"])
 

@@ -41,18 +41,18 @@ def save_image(path: Path, pixels: np.ndarray) -> None:
             Image.fromarray(pixels).save(path)
 
 
-def strip(photo: Tensor, image: Tensor, mask: Tensor | None = None) -> np.ndarray:
-    """Photo, render and error map side by side, [H, 3 W + 2 `GAP`, 3] uint8.
+def strip(photo: Tensor, image: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Photo, render and error map side by side, [H, 3 W + 2 `GAP`, 3] uint8 on their device.
 
     Args:
-        photo, image: [H, W, 3] float, 0 .. 1, on one device, where the strip is made.
+        photo, image: [H, W, 3] float, 0 .. 1, on one device.
         mask: [H, W] bool; where it is False, photo and error are `MASKED`. None: nowhere.
     """
     white = torch.full((photo.shape[0], GAP, 3), 255, dtype=torch.uint8, device=photo.device)
     truth, errors = rounded(photo), error_picture(photo, image)
     if mask is not None:
         truth, errors = (torch.where(mask[:, :, None], part, MASKED) for part in (truth, errors))
-    return torch.cat((truth, white, rounded(image), white, errors), dim=1).cpu().numpy()
+    return torch.cat((truth, white, rounded(image), white, errors), dim=1)
 
 
 def error_picture(photo: Tensor, image: Tensor) -> Tensor:

@@ -37,7 +37,8 @@ def write_report(run: RunSession) -> Path:
     for view_id in range(strips):
         image = render_view(trainer.gaussians, run.test, view_id, look)
         photo = run.test.photos.image(view_id, look.background)
-        save_image(pictures / f"test-{view_id:03d}.jpg", strip(photo, image, run.test.mask(view_id)))
+        pixels = strip(photo, image, run.test.mask(view_id)).cpu().numpy()
+        save_image(pictures / f"test-{view_id:03d}.jpg", pixels)
     _plot(run, pictures)
     run.clock.mark("pictures and plots")
     write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, strips))

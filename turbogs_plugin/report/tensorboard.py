@@ -93,7 +93,7 @@ class EventWriter(Listener):
         views = replace(self._test, cameras=self._test.cameras.to(trainer.device))
         image = render_view(trainer.gaussians, views, view, look)
         photo = views.photos.image(view, look.background).to(trainer.device)
-        picture = Image.fromarray(strip(photo, image, views.mask(view)))
+        picture = Image.fromarray(strip(photo, image, views.mask(view)).cpu().numpy())
         picture.thumbnail((WIDEST_STRIP, WIDEST_STRIP), Image.Resampling.LANCZOS)
         return np.asarray(picture)
 

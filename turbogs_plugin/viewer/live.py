@@ -1,44 +1,23 @@
 """The viewer of a training: a listener of its loop that draws frames between iterations, on their thread.
 
-It changes nothing that the training computes with, so the result stays bit for bit. While nobody looks it draws nothing
-and keeps nothing.
+Nothing that the training computes with changes, so the result stays bit for bit. While nobody looks, nothing is drawn
+or kept.
 """
 
 from __future__ import annotations
 
 import math
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
 
 from turbogs_plugin.device import synchronize
-from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.session import RunSession
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
-from turbogs_plugin.viewer.frames import Frames
-from turbogs_plugin.viewer.model_state import CaptureViews, DensityChange, ModelState
-from turbogs_plugin.viewer.pictures import Picture, Request, missing, shown_view
-from turbogs_plugin.viewer.server import Page, plain, serve_until_interrupted
-
-STATUS_SECONDS = 0.5
-"""Seconds between two updates of the page's text."""
-ABANDONED_SECONDS = 5.0
-"""Seconds after which a paused training whose last page was closed goes on."""
-
-
-@contextmanager
-def attached(port: int, host: str) -> Iterator[LiveViewer]:
-    """A viewer for a training, which listens while entered.
-
-    Raises:
-        InputError: viser is not installed, or the port is not free.
-    """
-    with closing(Page(host, port, training=True)) as page:
-        yield LiveViewer(page)
+from turbogs_plugin.viewer.pictures import CaptureViews, DensityChange, ModelState
+from turbogs_plugin.viewer.server import POLL_SECONDS, Page, serve_until_interrupted
 
 
 class LiveViewer(Listener):
@@ -50,33 +29,23 @@ class LiveViewer(Listener):
 
     def __init__(self, page: Page) -> None:
         self.page = page
-        self.frames = Frames(page.screens, page.wish)
         self.trainer: Trainer | None = None
         self._capture: CaptureViews | None = None
         self._samples: PixelSamples | None = None
         self._change: DensityChange | None = None
         self._psnr = math.nan
-        self._next_status = -math.inf
-        self._began, self._began_at = time.perf_counter(), 0
 
     def watch(self, session: RunSession) -> LiveViewer:
         """Take a run that is about to begin; itself, as a listener of its loop. The page's address is printed."""
         print(f"viewer  {self.page.url}", file=sys.stderr, flush=True)
-        return self.attach(session.trainer, session.test)
-
-    def attach(self, trainer: Trainer, test: PosedImages) -> LiveViewer:
-        """Take a trainer and the test views of its capture; itself, as a listener of the loop."""
-        self.trainer = trainer
-        self._capture = CaptureViews(trainer.views, test)
-        trainer.observer = self
+        self.trainer = session.trainer
+        self.trainer.observer = self
+        self._capture = CaptureViews(self.trainer.views, session.test)
         self.page.show_capture(self._capture)
         return self
 
-    def begun(self, loop: TrainingLoop) -> None:
-        self._began, self._began_at = time.perf_counter(), loop.trainer.iteration
-
     def advanced(self, loop: TrainingLoop) -> None:
-        if self.page.controls.paused:
+        if self.page.paused:
             self._hold(loop)
         elif self.page.watched:
             self._serve(loop.trainer, running=True)
@@ -88,7 +57,7 @@ class LiveViewer(Listener):
         self._samples = samples if self.page.watched else None
 
     def changing(self, gaussians: Gaussians, update: RowUpdate, step: Step) -> None:
-        self._change = DensityChange.of(gaussians, update, step.iteration) if self.page.watched else None
+        self._change = DensityChange.of(gaussians, update) if self.page.watched else None
 
     def stay(self) -> None:
         """Show the model after the training until Ctrl-C."""
@@ -98,74 +67,37 @@ class LiveViewer(Listener):
         serve_until_interrupted(self.page, lambda: self._serve(trainer, running=False))
 
     def _hold(self, loop: TrainingLoop) -> None:
-        """Wait until the page lets the training go on, or nobody is there who could, or it is to be stopped."""
-        controls, alone_since = self.page.controls, time.perf_counter()
-        self._next_status = -math.inf  # told at once
+        """Wait until the page asks for an iteration or lets the training go on, or the training is to be stopped."""
         with loop.clock.stopped():
-            while controls.paused and not loop.stopped and not controls.take_step():
-                if self.page.watched:
-                    alone_since = time.perf_counter()
-                elif time.perf_counter() - alone_since > ABANDONED_SECONDS:
-                    controls.set_paused(False)
-                if not self._serve(loop.trainer, running=False):
-                    controls.wait(0.05)
-        self.begun(loop)
-        self.page.refresh_controls()
+            while self.page.paused and not loop.stopped:
+                drawn = self._serve(loop.trainer, running=False)
+                if self.page.steps.acquire(timeout=0.0 if drawn else POLL_SECONDS):
+                    break
 
     def _serve(self, trainer: Trainer, running: bool) -> bool:
-        """Draw a frame if one is due, and keep the page's text up to date."""
+        """Draw a frame if one is due, and say what it shows."""
 
         def state() -> ModelState:
             synchronize(trainer.device)  # waiting for the iterations before is no cost of a frame
             return self._state(trainer)
 
-        drawn = self.frames.serve(state, trainer.iteration, running)
-        now = time.perf_counter()
-        if self.page.watched and now >= self._next_status:
-            self._next_status = now + STATUS_SECONDS
-            self.page.say(self._status(trainer, running, now))
+        drawn = self.page.frames.serve(state, trainer.iteration, running)
+        if drawn:
+            self.page.say(self._status(trainer, running))
         return drawn
 
     def _state(self, trainer: Trainer) -> ModelState:
         return ModelState(
             gaussians=trainer.gaussians,
-            sh_degree=trainer.sh_degree,
-            settings=trainer.config.raster,
-            background=trainer.background.evaluated,
+            look=Look(trainer.sh_degree, trainer.config.raster, trainer.background.evaluated),
             capture=self._capture,
-            maps=trainer.maps,
-            step=trainer.now,
+            maps=(trainer.maps, trainer.now),
             samples=self._samples,
             change=self._change,
         )
 
-    def _status(self, trainer: Trainer, running: bool, now: float) -> str:
-        speed = "paused" if self.page.controls.paused else "finished"
-        if running:
-            speed = f"{(trainer.iteration - self._began_at) / max(now - self._began, 1e-9):.0f} a second"
-            self._began, self._began_at = now, trainer.iteration
+    def _status(self, trainer: Trainer, running: bool) -> str:
+        doing = "" if running else " (paused)" if self.page.paused else " (finished)"
         psnr = "" if math.isnan(self._psnr) else f" · test PSNR {self._psnr:.2f} dB"
-        line = f"iteration **{trainer.iteration}** of {trainer.iterations} ({speed}) · "
-        line += f"{len(trainer.gaussians):,} Gaussians{psnr}"
-        return "\n\n".join([line, *described(self._state(trainer), self.page)])
-
-
-def described(state: ModelState, page: Page) -> list[str]:
-    """Lines about what the page shows: view, samples, what density control did; or why it shows nothing."""
-    picture, view = page.wish()
-    cameras = [screen.camera for screen in page.screens() if screen.camera is not None]
-    if not cameras:
-        return []
-    request = Request(picture, cameras[0], view)
-    if reason := missing(state, request):
-        return [f"*{reason}*"]
-    lines = []
-    if picture.of_view and state.capture is not None:
-        lines.append(f"`{plain(state.capture.name(shown_view(state, request)))}`")
-    if picture is Picture.SAMPLES and (samples := state.samples) is not None:
-        lines.append(f"{len(samples):,} pixels of {len(samples.view_ids)} views in this iteration")
-    if picture is Picture.CHANGES and (change := state.change) is not None:
-        did = change.update
-        counts = f"{did.num_split:,} split, {did.num_cloned:,} copied, {did.num_pruned:,} removed"
-        lines.append(f"iteration {change.iteration}: {counts}")
-    return lines
+        line = f"iteration **{trainer.iteration}** of {trainer.iterations}{doing}"
+        return f"{line} · {len(trainer.gaussians):,} Gaussians{psnr}"

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import math
-import re
 import socket
 import threading
 import time
@@ -23,9 +21,8 @@ import numpy as np
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.viewer.camera import ViewerCamera
-from turbogs_plugin.viewer.frames import Screen
-from turbogs_plugin.viewer.model_state import CaptureViews
-from turbogs_plugin.viewer.pictures import EXPLANATIONS, Picture
+from turbogs_plugin.viewer.frames import Frames
+from turbogs_plugin.viewer.pictures import CaptureViews, Picture
 
 if TYPE_CHECKING:
     import viser
@@ -36,73 +33,28 @@ MOST_FRUSTA = 150
 FRUSTUM_SIZE = 0.06
 """Size of a camera in the scene, in units of the scene's extent."""
 TRAIN_COLOR, TEST_COLOR = (40, 110, 220), (230, 140, 20)
+POLL_SECONDS = 0.02
+"""Seconds between two looks at what the page asks for, where no frame is due."""
 INSTALL = 'pip install "turbogs-plugin[viewer]"'
 
 
-class Controls:
-    """Whether a training may go on: set by the page's threads, read by the training's."""
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
-        self.paused = False
-        self._steps = 0
-
-    def set_paused(self, paused: bool, steps: int = 0) -> None:
-        """Pause, after `steps` more iterations, or go on."""
-        with self._changed:
-            self.paused, self._steps = paused, self._steps + steps if steps else 0
-            self._changed.notify_all()
-
-    def take_step(self) -> bool:
-        """Whether an iteration was asked for; it counts as made."""
-        with self._changed:
-            asked = self._steps > 0
-            self._steps -= asked
-            return asked
-
-    def wake(self) -> None:
-        """Let the thread that waits look again: a camera moved, or a picture was chosen."""
-        with self._changed:
-            self._changed.notify_all()
-
-    def wait(self, seconds: float) -> None:
-        """Wait until something changes, at most `seconds`."""
-        with self._changed:
-            if not self._steps:
-                self._changed.wait(seconds)
-
-
-def require_server(host: str, port: int) -> None:
-    """Raise `InputError` where viser is not installed, or no server can listen at `host` and `port`: viser itself
-    would silently take another port."""
-    try:
-        import viser  # noqa: F401
-    except ImportError as error:
-        lacking = "viser" if (error.name or "").partition(".")[0] == "viser" else error.name
-        raise InputError(f"the viewer needs {lacking}: {INSTALL}") from error
-    if not 0 <= port < 2**16:
-        raise InputError(f"port {port} of the viewer: it must be 1 to 65535")
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except (OSError, UnicodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"the viewer cannot listen at {host}:{port} ({reason}): name another port or host") from None
-
-
 def quiet_server(host: str, port: int) -> viser.ViserServer:
-    """A viser server that says nothing on standard output, which is the command's. Port 0 takes any free one."""
-    import viser
+    """A viser server that says nothing on standard output, which is the command's. Port 0 takes any free one.
 
-    require_server(host, port)
+    Raises:
+        InputError: viser is not installed, or no server can listen there (viser itself would take another port).
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError(f"the viewer needs {error.name}: {INSTALL}") from error
+    try:
+        socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+    except (OSError, OverflowError, UnicodeError) as error:
+        reason = (isinstance(error, OSError) and error.strerror) or error
+        raise InputError(f"the viewer cannot listen at {host}:{port} ({reason}): name another port or host") from None
     with contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=host, port=port, label="TurboGS", verbose=False)
-    if port not in (0, server.get_port()):
-        stop(server)
-        raise InputError(f"the viewer cannot listen at {host}:{port} (taken meanwhile): name another port")
-    return server
+        return viser.ViserServer(host=host, port=port, label="TurboGS", verbose=False)
 
 
 def stop(server: viser.ViserServer) -> None:
@@ -111,16 +63,9 @@ def stop(server: viser.ViserServer) -> None:
         server.stop()
 
 
-def address(host: str, port: int) -> str:
-    """The address that a browser on this machine opens to see a server that listens at `host`."""
-    # "::" is not localhost, which may mean 127.0.0.1 alone.
-    host = {"127.0.0.1": "localhost", "0.0.0.0": "localhost", "::": "::1"}.get(host, host)
-    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
-
-
-def plain(name: str) -> str:
-    """A file's name without what a page's Markdown could take for more than text: names come with captures."""
-    return re.sub(r"[^\w ./()+,-]", "?", name)
+def quoted(name: str) -> str:
+    """A name that comes with a capture as a Markdown text that cannot be more than text."""
+    return f"`{name.replace('`', '?')}`"
 
 
 class Page:
@@ -132,40 +77,63 @@ class Page:
         training: whether there is a training to control.
 
     Attributes:
-        picture, view: what the page shows.
-        controls: whether the training may go on.
+        paused: whether the training waits.
+        steps: iterations that a paused training is asked for.
 
     Raises:
         InputError: viser is not installed, or the port is not free.
     """
 
     def __init__(self, host: str, port: int, training: bool = False) -> None:
-        require_server(host, port)
-        self.controls = Controls()
-        self.picture, self.view = Picture.RENDER, 0
         self.capture: CaptureViews | None = None
-        self._screens: dict[int, Screen] = {}
-        self._frusta: list[Any] = []
+        self.frames = Frames(self._send, self.wish)
         self.server = quiet_server(host, port)
         _guard(self.server)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self.server.gui.main_panel.dock_right()
-        self.url = address(host, self.server.get_port())
-        self._build_panel(training)
+        host = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
+        self.url = f"http://{host}:{self.server.get_port()}"
+        self._frusta = self.server.scene.add_frame("/views", show_axes=False, visible=False)
+        gui: Any = self.server.gui  # its handles' values cannot be set, says its type
+        self._status = gui.add_markdown("Photos are being read, and error maps made.")
+        names = [picture.value for picture in Picture]
+        self._pictures = gui.add_dropdown("Picture", names, initial_value=names[0])
+        self._slider = gui.add_slider("View", 0, 1, 1, 0, visible=False)
+        self._there = gui.add_button("Stand at this view", visible=False)
+        self._cameras = gui.add_checkbox("Cameras of the capture", False, visible=False)
+        self._training = gui.add_folder("Training", visible=training)
+        with self._training:
+            self._pause = gui.add_button("Pause")
+            self._step = gui.add_button("One step")
+        self._pictures.on_update(lambda _: self._refresh())
+        self._there.on_click(lambda _: self.go_to(self._slider.value))
+        self._cameras.on_update(lambda _: self._refresh())
+        self._pause.on_click(lambda _: self.pause(not self.paused))
+        self._step.on_click(lambda _: self.step())
+        self.pause(False)
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(self._disconnected)
 
     @property
     def watched(self) -> bool:
         """Whether anybody looks."""
-        return bool(self._screens)
-
-    def screens(self) -> list[Screen]:
-        return list(self._screens.values())
+        return bool(self.server.get_clients())
 
     def wish(self) -> tuple[Picture, int]:
-        """The picture and the view that the pages show."""
-        return self.picture, self.view
+        """The picture and the view that the pages show; a picture that a client made up is the render."""
+        name = self._pictures.value
+        return Picture(name) if name in list(Picture) else Picture.RENDER, self._slider.value
+
+    def pause(self, paused: bool) -> None:
+        """Let the training wait, or go on; iterations that it was asked for are void."""
+        self.paused, self.steps = paused, threading.Semaphore(0)
+        self._pause.label = "Go on" if paused else "Pause"
+
+    def step(self) -> None:
+        """Ask for one iteration, after which the training waits."""
+        if not self.paused:
+            self.pause(True)
+        self.steps.release()
 
     def show_capture(self, capture: CaptureViews) -> None:
         """Offer the views of a capture, and stand at the first one."""
@@ -179,50 +147,41 @@ class Page:
         self.stand_at(ViewerCamera.of_view(cameras, 0))
         for number in evenly(len(capture), MOST_FRUSTA):
             views, view_id = capture.find(number)
-            self._add_frustum(number, ViewerCamera.of_view(views.cameras, view_id), views is capture.train)
+            camera = ViewerCamera.of_view(views.cameras, view_id)
+            frustum = self.server.scene.add_camera_frustum(
+                f"/views/{number}",
+                fov=camera.fov,
+                aspect=camera.width / camera.height,
+                scale=FRUSTUM_SIZE,
+                color=TRAIN_COLOR if views is capture.train else TEST_COLOR,
+                wxyz=camera.wxyz,
+                position=camera.position,
+            )
+            frustum.on_click(partial(self.go_to, number))
 
-    def stand_at(self, camera: ViewerCamera, distance: float = 1.0) -> None:
-        """Set where new clients stand, who turn about a point at `distance`, and move those who are there already."""
+    def stand_at(self, camera: ViewerCamera) -> None:
+        """Move all clients, those who come later too, to a camera; they turn about a point one unit before it."""
         _, down, forward = camera.rotation.T
         place = np.array(camera.position)
         start = self.server.initial_camera
-        start.position, start.look_at, start.up, start.fov = place, place + distance * forward, -down, camera.fov
+        start.position, start.look_at, start.up, start.fov = place, place + forward, -down, camera.fov
         for client in self.server.get_clients().values():
-            self._bring(client, camera)
+            # A client that claims to be at an impossible place stays there.
+            with contextlib.suppress(ValueError, AssertionError), client.atomic():
+                client.camera.position, client.camera.wxyz = place, np.array(camera.wxyz)
+                client.camera.fov = camera.fov
 
-    def say(self, text: str) -> None:
-        """Show the state of things, in Markdown."""
-        if self._status.content != text:
-            self._status.content = text
+    def say(self, line: str) -> None:
+        """Show a line of Markdown, and below it the line about the last frame."""
+        about = self.frames.about
+        self._status.content = f"{line}\n\n{quoted(about) if about else ''}"
 
-    def go_to(self, number: int) -> None:
+    def go_to(self, number: int, event: object = None) -> None:
         """Choose a view, and bring every client's camera there."""
-        self.choose_view(number)
-        if self.capture is None:
-            return
-        views, view_id = self.capture.find(self.view)
-        for client in self.server.get_clients().values():
-            self._bring(client, ViewerCamera.of_view(views.cameras, view_id))
-
-    def choose_view(self, number: float) -> None:
-        """Set the view that pictures of a view show; any number is brought within bounds."""
-        count = len(self.capture) if self.capture is not None else 1
-        self.view = int(min(max(0.0, float(number)), count - 1)) if math.isfinite(number) else 0
-        if self._slider.value != self.view:
-            self._slider.value = self.view
-        self.controls.wake()
-
-    def choose_picture(self, name: str) -> None:
-        """Set the picture by its name; an unknown name is ignored."""
-        if name in list(Picture):
-            self.picture = Picture(name)
-            self._about.content = EXPLANATIONS[self.picture]
-            self._refresh_visibility()
-            self.controls.wake()
-
-    def refresh_controls(self) -> None:
-        """Show whether the training waits."""
-        self._pause.label = "Go on" if self.controls.paused else "Pause"
+        if self.capture is not None:
+            self._slider.value = number = min(max(0, number), len(self.capture) - 1)
+            views, view_id = self.capture.find(number)
+            self.stand_at(ViewerCamera.of_view(views.cameras, view_id))
 
     def finished(self) -> None:
         """Hide the controls of a training that has ended."""
@@ -230,78 +189,27 @@ class Page:
 
     def close(self) -> None:
         """Turn everybody away."""
-        self._screens.clear()
         stop(self.server)
 
-    def _build_panel(self, training: bool) -> None:
-        gui: Any = self.server.gui  # its handles' values cannot be set, says its type
-        controls = self.controls
-        self._status = gui.add_markdown("Photos are being read, and error maps made.")
-        names = [picture.value for picture in Picture]
-        self._pictures = gui.add_dropdown("Picture", names, initial_value=self.picture.value)
-        self._about = gui.add_markdown(EXPLANATIONS[self.picture])
-        self._slider = gui.add_slider("View", 0, 1, 1, 0, visible=False)
-        self._there = gui.add_button("Stand at this view", visible=False)
-        self._cameras = gui.add_checkbox("Cameras of the capture", False, visible=False)
-        self._training = gui.add_folder("Training", visible=training)
-        with self._training:
-            self._pause = gui.add_button("Pause")
-            self._step = gui.add_button("One step")
-        self._pictures.on_update(lambda _: self.choose_picture(self._pictures.value))
-        self._slider.on_update(lambda _: self.choose_view(self._slider.value))
-        self._there.on_click(lambda _: self.go_to(self.view))
-        self._cameras.on_update(lambda _: self._refresh_visibility())
-        self._pause.on_click(lambda _: self._control(not controls.paused))
-        self._step.on_click(lambda _: self._control(True, 1))
-
-    def _control(self, paused: bool, steps: int = 0) -> None:
-        self.controls.set_paused(paused, steps)
-        self.refresh_controls()
-
-    def _refresh_visibility(self) -> None:
-        for frustum in self._frusta:
-            frustum.visible = bool(self._cameras.value) and not self.picture.of_view
-
-    def _add_frustum(self, number: int, camera: ViewerCamera, training: bool) -> None:
-        frustum = self.server.scene.add_camera_frustum(
-            f"/views/{number}",
-            fov=camera.fov,
-            aspect=camera.width / camera.height,
-            scale=FRUSTUM_SIZE,
-            color=TRAIN_COLOR if training else TEST_COLOR,
-            wxyz=camera.wxyz,
-            position=camera.position,
-            visible=False,
-        )
-        frustum.on_click(lambda _: self.go_to(number))
-        self._frusta.append(frustum)
-
-    def _bring(self, client: viser.ClientHandle, camera: ViewerCamera) -> None:
-        """Move a client's camera. A client that claims to be at an impossible place stays there."""
-        with contextlib.suppress(ValueError, AssertionError), client.atomic():
-            client.camera.position = np.array(camera.position)
-            client.camera.wxyz = np.array(camera.wxyz)
-            client.camera.fov = camera.fov
+    def _refresh(self) -> None:
+        """Show the cameras of the capture where they are asked for and can be seen."""
+        self._frusta.visible = bool(self._cameras.value) and not self.wish()[0].of_view
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        screen = Screen(partial(self._send, client))
-        self._screens[client.client_id] = screen
-        client.camera.on_update(lambda camera: self._looked(screen, camera))
-        self._looked(screen, client.camera)
+        client.camera.on_update(self._looked)
+        self._looked(client.camera)
 
     def _disconnected(self, client: viser.ClientHandle) -> None:
-        self._screens.pop(client.client_id, None)
-        self.controls.wake()
+        if not self.watched:
+            self.pause(False)  # nobody is left who could let the training go on
 
-    def _looked(self, screen: Screen, camera: viser.CameraHandle) -> None:
+    def _looked(self, camera: viser.CameraHandle) -> None:
         size = camera.image_width, camera.image_height
-        screen.look(ViewerCamera.checked(camera.position, camera.wxyz, camera.fov, *size), time.perf_counter())
-        self.controls.wake()
+        self.frames.look(ViewerCamera.checked(camera.position, camera.wxyz, camera.fov, *size))
 
-    def _send(self, client: viser.ClientHandle, pixels: np.ndarray, lossless: bool) -> None:
-        if client.client_id in self._screens:
-            kind: Literal["png", "jpeg"] = "png" if lossless else "jpeg"
-            client.scene.set_background_image(pixels, format=kind, jpeg_quality=JPEG_QUALITY)
+    def _send(self, pixels: np.ndarray, lossless: bool) -> None:
+        kind: Literal["png", "jpeg"] = "png" if lossless else "jpeg"
+        self.server.scene.set_background_image(pixels, format=kind, jpeg_quality=JPEG_QUALITY)
 
 
 def _guard(server: Any) -> None:
@@ -329,4 +237,4 @@ def serve_until_interrupted(page: Page, serve: Callable[[], bool]) -> None:
         print(f"viewer  {page.url}  (Ctrl-C ends)", flush=True)
         while True:
             if not serve():
-                page.controls.wait(0.05)
+                time.sleep(POLL_SECONDS)
