@@ -191,7 +191,7 @@ def with_other_features(capture: Path) -> Path:
 REFUSED = [
     (lambda capture: capture / "absent", "absent has no COLMAP reconstruction"),
     (without_model, "cup has no COLMAP reconstruction .* by  turbogs reconstruct .*cup --out SCENE"),
-    (without_photos, "5 of 6 photos are missing in .*images: 01.png, 02.png, 03.png, ...; restore them"),
+    (without_photos, "names 6 photos, of which 5 are missing in .*01.png, 02.png, 03.png, .*: at least 3 are needed"),
     (without_points, "sparse/0 has no points that its photos show"),
     (with_distortion, r"6 of 6 cameras have distortion \(OPENCV\)"),
     (with_other_features, r"half of its points are more than 12.8 pixels \(2% of .*: reconstruct the photos again"),

@@ -23,7 +23,7 @@ from turbogs_plugin.captures.bundle_adjustment import (
     of_these_photos,
     refine_together,
 )
-from turbogs_plugin.captures.capture import LARGEST_SIDE, Capture, named
+from turbogs_plugin.captures.capture import LARGEST_SIDE, Capture
 from turbogs_plugin.captures.colmap import find_model, load_pycolmap, read_colmap, read_reconstruction, write_whole
 from turbogs_plugin.captures.mask_files import FOLDER as MASKS
 from turbogs_plugin.errors import InputError
@@ -97,10 +97,6 @@ def write_refined(scene: Path, out: Path) -> str:
 def _required_observations(model: Path, capture: Capture) -> Observations:
     """The places where photos show points. Raises `InputError` where a capture cannot be refined."""
     names = capture.names
-    if absent := [name for name in names if not (capture.photo_folder / name).is_file()]:
-        raise InputError(
-            f"{len(absent)} of {len(names)} photos are missing in {capture.photo_folder}: {named(absent)}; restore them"
-        )
     if bent := [lens.model for lens in capture.lenses if lens is not None]:
         raise InputError(
             f"{model}: {len(bent)} of {len(names)} cameras have distortion ({bent[0]}), and refined cameras are "
