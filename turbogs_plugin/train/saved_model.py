@@ -6,6 +6,7 @@ is told not to (`turbogs_plugin.model.gsplat_world`); `train.init_world` says wh
 
 from __future__ import annotations
 
+import operator
 import re
 import shlex
 from collections.abc import Mapping
@@ -87,8 +88,12 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         gaussians = read_gsplat({"splats": trained["gaussians"]}, checkpoint).map(
             lambda value: value.float().to(device)
         )
+        if not all(value.isfinite().all() for _, value in gaussians.items()):
+            raise ValueError("its Gaussians are not finite")
         exposures = trained["exposures"]["offsets"].to(device) if config.train.exposure is True else None
-        return SavedModel(folder, config, gaussians, frame_of_state(state), int(trained["iteration"]), exposures)
+        return SavedModel(
+            folder, config, gaussians, frame_of_state(state), operator.index(trained["iteration"]), exposures
+        )
     except (KeyError, TypeError, AttributeError, IndexError, ValueError, RuntimeError) as error:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
 
