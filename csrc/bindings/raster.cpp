@@ -1,6 +1,5 @@
 // The kernels of the rasterizer as torch operators; see arguments.h.
 #include "bindings/arguments.h"
-#include "bindings/views.h"
 #include "raster/raster_params.h"
 
 namespace turbogs {
@@ -23,9 +22,7 @@ ForwardParams read_forward(const Arguments<Launch>& in) {
     params.alpha_min = in.number(R::alpha_min);
     params.alpha_max = in.number(R::alpha_max);
     params.transmittance_min = in.number(R::transmittance_min);
-    params.background[0] = in.number(R::background_red);
-    params.background[1] = in.number(R::background_green);
-    params.background[2] = in.number(R::background_blue);
+    read_background(in, params.background);
     in.set_structs(params.cameras, T::cameras, num_views);
     in.set_optional(params.tile_ids, T::tile_ids, {num_active});
     in.set(params.tile_offsets, T::tile_offsets, {num_active + 1});
@@ -73,7 +70,7 @@ void launches::RasterProject::run(const Arguments<RasterProject>& in) {
     in.set(params.radii, Tensors::radii, {views, count, 2});
     in.set(params.tile_differences, Tensors::tile_cursors, {params.num_active + 1});
     in.set_optional(params.records, Tensors::records, {total, ScreenRecord::kSize});
-    check_launched(launch_projection(params, in.stream()), "projection");
+    launch_projection(params, in.stream());
 }
 
 void launches::RasterCountIntersections::run(const Arguments<RasterCountIntersections>& in) {
@@ -88,7 +85,7 @@ void launches::RasterCountIntersections::run(const Arguments<RasterCountIntersec
     in.set(params.status, Tensors::status, {2});
     in.set(params.counters, Tensors::counters, {2}, ScalarType::Int);
     in.set(params.block_sums, Tensors::block_sums, {scan_blocks(params.num_active), 2});
-    check_launched(launch_count_intersections(params, in.stream()), "count of intersections");
+    launch_count_intersections(params, in.stream());
 }
 
 void launches::RasterSortIntersections::run(const Arguments<RasterSortIntersections>& in) {
@@ -115,12 +112,12 @@ void launches::RasterSortIntersections::run(const Arguments<RasterSortIntersecti
     in.set(params.runs, Tensors::runs, {capacity / kLeastOfRun, 2});
     in.set_quads(params.intersection_ids, Tensors::intersection_ids, {capacity});
     params.windows = reinterpret_cast<uint2*>(params.intersection_ids);
-    check_launched(launch_scatter_intersections(params, in.stream()), "scatter of intersections");
-    check_launched(launch_sort_intersections(params, in.stream()), "sort of intersections");
+    launch_scatter_intersections(params, in.stream());
+    launch_sort_intersections(params, in.stream());
 }
 
 void launches::RasterForward::run(const Arguments<RasterForward>& in) {
-    check_launched(launch_rasterize_forward(read_forward(in), in.stream()), "forward");
+    launch_rasterize_forward(read_forward(in), in.stream());
 }
 
 void launches::RasterBackward::run(const Arguments<RasterBackward>& in) {
@@ -137,7 +134,7 @@ void launches::RasterBackward::run(const Arguments<RasterBackward>& in) {
     in.set_optional(params.depth_gradients, Tensors::depth_gradients, {num_slots});
     in.set_optional(params.pixel_errors, Tensors::pixel_errors, {num_slots});
     in.set_quads(params.records, Tensors::records, {total, ScreenRecord::kSize});
-    check_launched(launch_rasterize_backward(params, in.stream()), "backward");
+    launch_rasterize_backward(params, in.stream());
 }
 
 void launches::CollectRecords::run(const Arguments<CollectRecords>& in) {
@@ -174,7 +171,7 @@ void launches::CollectRecords::run(const Arguments<CollectRecords>& in) {
     STD_TORCH_CHECK(end == all && all <= kMaxViews, "turbogs: records of ", end, " views of ", all);
     in.set(params.target_records, Tensors::target_records, {all, rows, whole});
     in.set(params.target_radii, Tensors::target_radii, {all, rows, 2});
-    check_launched(launch_collect_records(params, in.stream()), "collection of records");
+    launch_collect_records(params, in.stream());
 }
 
 void launches::GatherColors::run(const Arguments<GatherColors>& in) {
@@ -200,7 +197,7 @@ void launches::GatherColors::run(const Arguments<GatherColors>& in) {
     in.set(params.colors, Tensors::colors, {numbers / 3, 3});
     in.set(params.seen, Tensors::seen, {2});
     in.set_optional(params.overflow, Tensors::overflow, {1});
-    check_launched(launch_gather_colors(params, in.stream()), "gathering of colours");
+    launch_gather_colors(params, in.stream());
 }
 
 }  // namespace turbogs

@@ -12,7 +12,6 @@
 #include <cuda_fp16.h>
 
 #include "common/approximate_math.cuh"
-#include "common/tiles.cuh"
 #include "common/warp.cuh"
 #include "loss/sample_loss.cuh"
 
@@ -294,20 +293,17 @@ void launch(const SparseLossParams& params, cudaStream_t stream) {
 
 }  // namespace
 
-cudaError_t launch_count_filled(const CountFilledParams& params, cudaStream_t stream) {
-    if (params.num_slots == 0) return cudaSuccess;
+void launch_count_filled(const CountFilledParams& params, cudaStream_t stream) {
+    if (params.num_slots == 0) return;
     const int blocks = std::min(blocks_for(params.num_slots, kThreadSlots * kCountThreads), kCountBlocks);
     count_filled_kernel<<<blocks, kCountThreads, 0, stream>>>(params);
-    return cudaGetLastError();
 }
 
-cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
-    if (params.num_slots == 0 || params.num_tiles == 0) return cudaSuccess;
+void launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
+    if (params.num_slots == 0 || params.num_tiles == 0) return;
     if (params.photos != nullptr && params.channels == 4) launch<true>(params, stream);
     else launch<false>(params, stream);
-    const cudaError_t error = cudaGetLastError();
-    if (error != cudaSuccess || params.structure != Structure::kSsim) return error;
-    return launch_window_similarity(params, stream);
+    if (params.structure == Structure::kSsim) launch_window_similarity(params, stream);
 }
 
 }  // namespace turbogs

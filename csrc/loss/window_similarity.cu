@@ -6,7 +6,6 @@
 // through them, and from these three terms of the gradient, which a window gives to its pixels as it took theirs: the
 // Gaussian is symmetric. Means are relative to the tile's first sample. A place without a sample has weight 0. All of a
 // tile stays in shared memory: a sample's colour and truth are read once, its gradient is read and written once.
-#include "common/tiles.cuh"
 #include "common/warp.cuh"
 #include "loss/sample_loss.cuh"
 
@@ -193,13 +192,12 @@ __global__ void __launch_bounds__(kWindowThreads)
 
 }  // namespace
 
-cudaError_t launch_window_similarity(const SparseLossParams& params, cudaStream_t stream) {
+void launch_window_similarity(const SparseLossParams& params, cudaStream_t stream) {
     if (params.photos != nullptr && params.channels == 4) {
         window_similarity_kernel<true><<<params.num_tiles, kWindowThreads, 0, stream>>>(params);
     } else {
         window_similarity_kernel<false><<<params.num_tiles, kWindowThreads, 0, stream>>>(params);
     }
-    return cudaGetLastError();
 }
 
 }  // namespace turbogs
