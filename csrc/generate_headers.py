@@ -19,9 +19,6 @@ LAUNCHES = ROOT / "turbogs_plugin/engine/cuda/launches/__init__.py"
 SAMPLES = ROOT / "turbogs_plugin/types/samples.py"
 """The file of TILE_SIZE, which imports torch: it is read, not run."""
 
-ENUMERATIONS = {"UNITS": "SampleUnit", "STRUCTURES": "Structure", "UPDATE_KINDS": "UpdateKind"}
-"""Their names in C++."""
-
 
 def load(path: Path) -> ModuleType:
     """A module of one file, or a package, without the packages around it, which would import torch."""
@@ -44,10 +41,9 @@ def layout_header(layout: ModuleType) -> str:
     for name, value in vars(layout).items():
         if isinstance(value, int):
             lines.append(f"constexpr int k{camel_case(name)} = {value};")
-        elif name in ENUMERATIONS:
+        elif isinstance(value, tuple):
             entries = ", ".join(f"k{camel_case(entry)}" for entry in value)
-            lines.append(f"enum class {ENUMERATIONS[name]} : int {{ {entries} }};")
-            lines.append(f"constexpr int kNum{ENUMERATIONS[name]}s = {len(value)};")
+            lines.append(f"enum class {camel_case(name)[:-1]} : int {{ {entries} }};")
         elif isinstance(value, type):
             places = {column: place.start for column, place in layout.columns(value).items()}
             lines.append(f"struct {name} {{")

@@ -55,13 +55,6 @@ inline void check_launched(cudaError_t error, const char* what) {
     STD_TORCH_CHECK(error == cudaSuccess, "turbogs: ", what, ": ", cudaGetErrorString(error));
 }
 
-// A value of an enumeration of layout.h, whose entries are numbered from 0. `allowed` names them.
-template <class Enumeration>
-Enumeration to_enumeration(int64_t value, int count, const char* allowed) {
-    STD_TORCH_CHECK(value >= 0 && value < count, "turbogs: ", allowed);
-    return static_cast<Enumeration>(value);
-}
-
 // What a tensor holds whose memory a kernel takes as `T*`: numbers of T, or what T is made of. A uint16_t has the
 // bits of a half; structs are made of floats.
 template <class T>
@@ -91,10 +84,6 @@ public:
 
     Arguments(const TensorList& tensors, const IntegerList& integers, const RealList& reals, const IntegerList& rows)
         : tensors_(tensors), integers_(integers), reals_(reals), rows_(rows) {
-        STD_TORCH_CHECK(tensors.size() == Launch::kNumTensors && integers.size() == Launch::kNumIntegers &&
-                            reals.size() == Launch::kNumReals,
-                        "turbogs: ", Launch::kName, " takes ", Launch::kNumTensors, " tensors, ", Launch::kNumIntegers,
-                        " integers and ", Launch::kNumReals, " reals");
         const Tensor& first = tensor(Tensors{});
         STD_TORCH_CHECK(first.is_cuda(), "turbogs: expected CUDA tensors");
         device_ = first.get_device_index();
@@ -113,6 +102,10 @@ public:
         STD_TORCH_CHECK(has(field), "turbogs: ", Launch::kName, " needs ", name(field));
         return *tensors_[static_cast<size_t>(field)];
     }
+
+    // The tensors of a field `list[Tensor]` in Python, which follow the others: number, and field of each.
+    int64_t num_more() const { return static_cast<int64_t>(tensors_.size() - Launch::kNumTensors); }
+    static Tensors more(int64_t place) { return static_cast<Tensors>(Launch::kNumTensors + place); }
 
     int64_t integer(Integers field) const { return integers_[static_cast<size_t>(field)]; }
     double real(Reals field) const { return reals_[static_cast<size_t>(field)]; }
@@ -175,7 +168,9 @@ public:
     }
 
 private:
-    static const char* name(Tensors field) { return Launch::kTensorNames[static_cast<size_t>(field)]; }
+    static const char* name(Tensors field) {
+        return field < more(0) ? Launch::kTensorNames[static_cast<size_t>(field)] : "memory of a process";
+    }
 
     static std::string describe(ScalarType type, const int64_t* sizes, int64_t count, int device) {
         std::ostringstream out;

@@ -126,9 +126,7 @@ void launches::RasterBackward::run(const Arguments<RasterBackward>& in) {
                     "turbogs: depth gradients without depths");
     BackwardParams params = {};
     params.forward = read_forward(in);
-    params.num_instances = to_int(total, "views * Gaussians");
     params.with_density_sums = in.integer(Integers::with_density_sums) != 0;
-    params.cleared = in.integer(Integers::cleared) != 0;
     in.set(params.color_gradients, Tensors::color_gradients, {num_slots, 3});
     in.set_optional(params.alpha_gradients, Tensors::alpha_gradients, {num_slots});
     in.set_optional(params.depth_gradients, Tensors::depth_gradients, {num_slots});
@@ -138,18 +136,15 @@ void launches::RasterBackward::run(const Arguments<RasterBackward>& in) {
 }
 
 void launches::CollectRecords::run(const Arguments<CollectRecords>& in) {
-    constexpr Tensors kRecords[kMaxPeers] = {Tensors::records_0, Tensors::records_1, Tensors::records_2,
-                                             Tensors::records_3, Tensors::records_4, Tensors::records_5,
-                                             Tensors::records_6, Tensors::records_7};
-    constexpr Tensors kRadii[kMaxPeers] = {Tensors::radii_0, Tensors::radii_1, Tensors::radii_2, Tensors::radii_3,
-                                           Tensors::radii_4, Tensors::radii_5, Tensors::radii_6, Tensors::radii_7};
-    const Tensor &source = in.tensor(Tensors::radii_0), &target = in.tensor(Tensors::target_radii);
+    const int64_t num_sources = in.num_rows(1);
+    STD_TORCH_CHECK(num_sources <= kMaxPeers && in.num_more() == 2 * num_sources, "turbogs: records and radii of up to ",
+                    kMaxPeers, " processes are collected");
+    const Tensor &source = in.tensor(in.more(1)), &target = in.tensor(Tensors::target_radii);
     STD_TORCH_CHECK(source.dim() == 3 && target.dim() == 3, "turbogs: radii must be [views, Gaussians, 2]");
     const int64_t count = source.size(1), all = target.size(0), rows = target.size(1);
-    const int64_t first_row = in.integer(Integers::first_row), num_sources = in.num_rows(1);
+    const int64_t first_row = in.integer(Integers::first_row);
     STD_TORCH_CHECK(first_row >= 0 && first_row + rows <= count, "turbogs: rows ", first_row, " .. ", first_row + rows,
                     " of ", count);
-    STD_TORCH_CHECK(num_sources <= kMaxPeers, "turbogs: records of up to ", kMaxPeers, " processes are collected");
     CollectParams params = {};
     params.num_sources = static_cast<int>(num_sources);
     params.num_views = to_int(all, "views");
@@ -159,14 +154,14 @@ void launches::CollectRecords::run(const Arguments<CollectRecords>& in) {
     const auto whole = ScreenRecord::kSize;
     int64_t end = 0;  // of the views so far
     for (int i = 0; i < params.num_sources; ++i) {
-        const int64_t views = in.tensor(kRadii[i]).size(0), first = *in.row(i, 1);
+        const int64_t views = in.tensor(in.more(2 * i + 1)).size(0), first = *in.row(i, 1);
         STD_TORCH_CHECK(views > 0 && (first == end || (i > 0 && first == end - 1)),
                         "turbogs: the views of a process begin with the last one of the process before, or the next");
         end = first + views;
         params.sources[i].num_views = to_int(views, "views");
         params.sources[i].first_view = to_int(first, "views");
-        in.set(params.sources[i].records, kRecords[i], {views, count, whole});
-        in.set(params.sources[i].radii, kRadii[i], {views, count, 2});
+        in.set(params.sources[i].records, in.more(2 * i), {views, count, whole});
+        in.set(params.sources[i].radii, in.more(2 * i + 1), {views, count, 2});
     }
     STD_TORCH_CHECK(end == all && all <= kMaxViews, "turbogs: records of ", end, " views of ", all);
     in.set(params.target_records, Tensors::target_records, {all, rows, whole});
@@ -175,17 +170,15 @@ void launches::CollectRecords::run(const Arguments<CollectRecords>& in) {
 }
 
 void launches::GatherColors::run(const Arguments<GatherColors>& in) {
-    constexpr Tensors kPeers[kMaxPeers] = {Tensors::peer_0, Tensors::peer_1, Tensors::peer_2, Tensors::peer_3,
-                                           Tensors::peer_4, Tensors::peer_5, Tensors::peer_6, Tensors::peer_7};
     GatherParams params = {};
     const int64_t num_peers = in.num_rows(1), first = in.integer(Integers::first);
-    STD_TORCH_CHECK(num_peers <= kMaxPeers && first >= PassStatus::kSize, "turbogs: up to ", kMaxPeers,
-                    " processes gather colours, which begin behind their status");
+    STD_TORCH_CHECK(num_peers <= kMaxPeers && in.num_more() == num_peers && first >= PassStatus::kSize,
+                    "turbogs: up to ", kMaxPeers, " processes gather colours, which begin behind their status");
     params.num_peers = static_cast<int>(num_peers);
     params.first = to_int(first, "numbers of a memory");
     int64_t numbers = 0;
     for (int i = 0; i < params.num_peers; ++i) {
-        const Tensors peer = kPeers[i];
+        const Tensors peer = in.more(i);
         const int64_t size = in.tensor(peer).numel(), samples = *in.row(i, 1);
         STD_TORCH_CHECK(samples >= 0 && samples <= (size - first) / 3, "turbogs: process ", i, " has no ", samples,
                         " colours in memory for ", size, " numbers");

@@ -26,8 +26,7 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
         tiles += count;
     }
     params.num_tiles = to_int(tiles, "tiles");
-    params.unit = to_enumeration<SampleUnit>(in.integer(Integers::unit), kNumSampleUnits,
-                                             "unit must be 0 (pixel) or 1 (tile)");
+    params.unit = static_cast<SampleUnit>(in.integer(Integers::unit));
     STD_TORCH_CHECK(params.unit == SampleUnit::kTile || chosen == tiles,
                     "turbogs: tile_ids must have an entry for each tile");
     const bool at_origin = params.views[0].origin_x == 0 && params.views[0].origin_y == 0;
@@ -64,14 +63,6 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     launch_sample_pixels(params, in.stream());
 }
 
-void launches::CountFilled::run(const Arguments<CountFilled>& in) {
-    CountFilledParams params = {};
-    params.num_slots = to_int(in.tensor(Tensors::pixel_ids).numel(), "samples");
-    in.set(params.pixel_ids, Tensors::pixel_ids, {params.num_slots});
-    in.set(params.num_filled, Tensors::num_filled, {1});
-    launch_count_filled(params, in.stream());
-}
-
 void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
     const int64_t slots = in.tensor(Tensors::pixel_ids).numel(), tiles = in.tensor(Tensors::tile_ids).numel();
     const bool has_photos = in.has(Tensors::photos), has_maps = in.has(Tensors::errors);
@@ -88,8 +79,7 @@ void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
     read_views(in, ViewRow::kSize, has_maps ? map_pixels : photo_pixels, params);
     params.num_tiles = to_int(tiles, "tiles");
     params.num_slots = to_int(slots, "samples");
-    params.structure = to_enumeration<Structure>(in.integer(Integers::structure), kNumStructures,
-                                                 "structure must be 0 .. 3: none, ncc, ssim or printed_ncc");
+    params.structure = static_cast<Structure>(in.integer(Integers::structure));
     params.epsilon = in.number(Reals::epsilon);
     params.l1_weight = in.number(Reals::l1_weight);
     params.structure_weight = in.number(Reals::structure_weight);
@@ -179,8 +169,7 @@ void launches::FusedStep::run(const Arguments<FusedStep>& in) {
     const int64_t count = params.num_gaussians, harmonics = 3 * params.bands;
     const double beta1 = in.real(Reals::beta1), beta2 = in.real(Reals::beta2);
     OptimizerParams optimizer = {};
-    optimizer.kind = to_enumeration<UpdateKind>(in.integer(Integers::kind), kNumUpdateKinds,
-                                                "kind must be 0 (Adam), 1 (balanced LM) or 2 (paper's LM)");
+    optimizer.kind = static_cast<UpdateKind>(in.integer(Integers::kind));
     optimizer.rows_per_view = in.integer(Integers::rows_per_view) != 0;
     const auto set_rates = [&](int first, int size, Reals rate) {
         std::fill_n(optimizer.rates + first, size, in.number(rate));

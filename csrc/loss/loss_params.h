@@ -46,13 +46,6 @@ struct SparseLossParams {
     int16_t stamp;
 };
 
-// Adds the filled slots (id >= 0) to `num_filled`.
-struct CountFilledParams {
-    const int32_t* pixel_ids;  // [P]
-    int num_slots;             // P
-    int32_t* num_filled;       // [1]
-};
-
 // ---- Exposures, which turbogs_plugin/engine/reference/exposed_colors.py defines ----------------------------------
 
 constexpr int kExposureNumbers = 12;  // of a photo's map less the identity: rows of A | b
@@ -92,7 +85,6 @@ struct ExposureStepParams {
 };
 
 // A launcher only enqueues work on `stream`; `call` in bindings/library.cpp looks for its errors.
-void launch_count_filled(const CountFilledParams& params, cudaStream_t stream);
 void launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream);
 void launch_expose_colors(const ExposeColorsParams& params, cudaStream_t stream);
 void launch_exposure_backward(const ExposureBackwardParams& params, cudaStream_t stream);

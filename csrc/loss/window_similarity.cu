@@ -160,7 +160,7 @@ __global__ void __launch_bounds__(kWindowThreads)
         const float covariance = fminf(fmaxf(moments[4] - mean_x * mean_y, -largest), largest);
         // So that a window which seems to have no variance beside colours of thousands has no slope of rounding.
         const float steady = kSsimConstant + kRounding * (moments[2] + moments[3]);
-        const LuminanceSimilarity similarity =
+        const Similarity similarity =
             ssim(mean_x + first_x, mean_y + first_y, variance_x, variance_y, covariance, steady);
         if (weight > 0.0f) missing += 1.0f - similarity.value;
 
@@ -193,11 +193,9 @@ __global__ void __launch_bounds__(kWindowThreads)
 }  // namespace
 
 void launch_window_similarity(const SparseLossParams& params, cudaStream_t stream) {
-    if (params.photos != nullptr && params.channels == 4) {
-        window_similarity_kernel<true><<<params.num_tiles, kWindowThreads, 0, stream>>>(params);
-    } else {
-        window_similarity_kernel<false><<<params.num_tiles, kWindowThreads, 0, stream>>>(params);
-    }
+    const bool alpha = params.photos != nullptr && params.channels == 4;
+    const auto kernel = alpha ? window_similarity_kernel<true> : window_similarity_kernel<false>;
+    kernel<<<params.num_tiles, kWindowThreads, 0, stream>>>(params);
 }
 
 }  // namespace turbogs

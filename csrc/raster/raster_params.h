@@ -134,14 +134,12 @@ struct ForwardParams {
 // Stage 6. Same work items; gradients on the screen.
 struct BackwardParams {
     ForwardParams forward;         // as given to stage 5; its outputs are inputs here
-    int num_instances;
     bool with_density_sums;        // fill what density control asks for: absolute, distance and square sums; else zeros
-    bool cleared;                  // `records` are zero where the radius is not 0
     const float* color_gradients;  // [P, 3]
     const float* alpha_gradients;  // [P] or null
     const float* depth_gradients;  // [P] or null
     const float* pixel_errors;     // [P] or null
-    float* records;                // [K, N, 16] out, ScreenRecord; off screen zero, or where `cleared`, left alone
+    float* records;                // [K, N, 16] added to, ScreenRecord
 };
 
 // What a process has rendered of a batch: V views of N Gaussians.

@@ -310,9 +310,6 @@ __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_consta
 }  // namespace
 
 void launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream) {
-    if (params.num_instances == 0) return;
-    const size_t bytes = sizeof(float) * ScreenRecord::kSize * static_cast<size_t>(params.num_instances);
-    if (!params.cleared) cudaMemsetAsync(params.records, 0, bytes, stream);
     const int items = params.forward.num_active * params.forward.chunks;
     if (items == 0) return;
     const bool density = params.with_density_sums;
