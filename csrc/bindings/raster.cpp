@@ -137,8 +137,8 @@ void launches::RasterBackward::run(const Arguments<RasterBackward>& in) {
 
 void launches::CollectRecords::run(const Arguments<CollectRecords>& in) {
     const int64_t num_sources = in.num_rows(1);
-    STD_TORCH_CHECK(num_sources <= kMaxPeers && in.num_more() == 2 * num_sources, "turbogs: records and radii of up to ",
-                    kMaxPeers, " processes are collected");
+    STD_TORCH_CHECK(num_sources <= kMaxPeers && in.num_more() == 2 * num_sources,
+                    "turbogs: records and radii of up to ", kMaxPeers, " processes are collected");
     const Tensor &source = in.tensor(in.more(1)), &target = in.tensor(Tensors::target_radii);
     STD_TORCH_CHECK(source.dim() == 3 && target.dim() == 3, "turbogs: radii must be [views, Gaussians, 2]");
     const int64_t count = source.size(1), all = target.size(0), rows = target.size(1);

@@ -1,5 +1,5 @@
-// What the kernels of the loss share: the true colour of a sample, how alike prediction and truth are over the samples of
-// a tile or a window in one channel (the structure terms of turbogs_plugin/engine/reference/losses.py with their
+// What the kernels of the loss share: the true colour of a sample, how alike prediction and truth are over the samples
+// of a tile or a window in one channel (the structure terms of turbogs_plugin/engine/reference/losses.py with their
 // gradients, as functions of the moments), and adding to a loss.
 #pragma once
 

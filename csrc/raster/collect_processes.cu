@@ -1,5 +1,5 @@
 // Collection of what all processes of a batch have rendered, out of memory that may be other GPUs', mapped here.
-// Defined by turbogs_plugin/engine/reference/records.py. What is not read does not travel, and a read from another GPU takes
+// Defined by turbogs_plugin/engine/shared.py. What is not read does not travel, and a read from another GPU takes
 // some thousand clocks, so a thread has all its reads of a process under way before it adds or writes. Loads are plain:
 // what another GPU has written lies in no cache of this one when a kernel begins.
 #include "common/warp.cuh"

@@ -15,7 +15,7 @@
 
 namespace turbogs {
 
-// A tile with more than kSortRun intersections has at least kLeastOfRun for each of its runs, so this bounds their number.
+// A tile with more than kSortRun intersections has at least kLeastOfRun for each of its runs: a bound of their number.
 constexpr int kLeastOfRun = kSortRun / 2;
 
 // One view as the kernels read it. Written by the projection's launcher.

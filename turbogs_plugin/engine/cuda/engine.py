@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.base import BaseEngine
 from turbogs_plugin.engine.cuda import launches, library, training
 from turbogs_plugin.engine.cuda.raster import (
     Buffers,
@@ -21,11 +20,11 @@ from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, RenderOptions, ScreenRecords
 from turbogs_plugin.engine.rules import LossTerms
-from turbogs_plugin.engine.shared import PassMemory
+from turbogs_plugin.engine.shared import PassMemory, SharedEngine
 from turbogs_plugin.types import BLACK, Cameras, Gaussians, LossOutput, PixelSamples
 
 
-class CudaEngine(BaseEngine):
+class CudaEngine(SharedEngine):
     """`Engine` on one CUDA device, on torch's current stream, float32.
 
     Args:
