@@ -7,7 +7,6 @@ Environment:
     TURBOGS_CUDA_ARCH: compute capabilities to build for, such as ``90`` or ``80;90``, in place of the GPUs found here;
         8.0 or newer. ``compute_80`` is PTX of 8.0, which the driver compiles when it loads the library: on any GPU from
         8.0, at the price of a slow first call. Several capabilities bring PTX of the newest, unless PTX is named.
-    TURBOGS_EXACT_MATH: ``1`` builds the kernels with correctly rounded functions (csrc/common/approximate_math.cuh).
 """
 
 from __future__ import annotations
@@ -200,8 +199,7 @@ class BuildCuda(build_ext):
 
     def cuda_command(self) -> list[str]:
         flags = ["-O3", "-std=c++17", "-lineinfo", "-Xcompiler", "-fPIC,-fvisibility=hidden"]
-        exact = int(os.environ.get("TURBOGS_EXACT_MATH", "0"))
-        return [str(toolchain.nvcc), *toolchain.code_flags, *flags, f"-DTURBOGS_EXACT_MATH={exact}"]
+        return [str(toolchain.nvcc), *toolchain.code_flags, *flags]
 
     def cpp_command(self) -> list[str]:
         # nvcc hands .cpp files to the host compiler, and knows where the toolkit's headers are.

@@ -7,8 +7,8 @@
 
 from __future__ import annotations
 
-import ast
 import importlib.util
+import re
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -16,13 +16,8 @@ from types import ModuleType
 ROOT = Path(__file__).resolve().parent.parent
 LAYOUT = ROOT / "turbogs_plugin/engine/layout.py"
 LAUNCHES = ROOT / "turbogs_plugin/engine/cuda/launches/__init__.py"
-CONSTANTS = {
-    ROOT / "turbogs_plugin/types/samples.py": ("TILE_SIZE",),
-}
-"""Further numbers, of files that import torch: they are read, not run."""
-
-ENUMERATIONS = {"UNITS": "SampleUnit", "STRUCTURES": "Structure", "UPDATE_KINDS": "UpdateKind"}
-"""Their names in C++."""
+SAMPLES = ROOT / "turbogs_plugin/types/samples.py"
+"""The file of TILE_SIZE, which imports torch: it is read, not run."""
 
 
 def load(path: Path) -> ModuleType:
@@ -35,30 +30,20 @@ def load(path: Path) -> ModuleType:
     return module
 
 
-def constants() -> dict[str, int]:
-    """The numbers of `CONSTANTS`."""
-    found = {}
-    for path, names in CONSTANTS.items():
-        for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", None) in names:
-                found[node.targets[0].id] = ast.literal_eval(node.value)
-    return found
-
-
 def camel_case(name: str) -> str:
     return "".join(part.capitalize() for part in name.split("_"))
 
 
 def layout_header(layout: ModuleType) -> str:
     """Numbers, enumerations, and a struct of the first columns of each row."""
-    lines = [f"constexpr int k{camel_case(name)} = {value};" for name, value in constants().items()]
+    tile_size = re.search(r"^TILE_SIZE = (\d+)", SAMPLES.read_text(), re.MULTILINE)
+    lines = [f"constexpr int kTileSize = {tile_size[1]};"]
     for name, value in vars(layout).items():
         if isinstance(value, int):
             lines.append(f"constexpr int k{camel_case(name)} = {value};")
-        elif name in ENUMERATIONS:
+        elif isinstance(value, tuple):
             entries = ", ".join(f"k{camel_case(entry)}" for entry in value)
-            lines.append(f"enum class {ENUMERATIONS[name]} : int {{ {entries} }};")
-            lines.append(f"constexpr int kNum{ENUMERATIONS[name]}s = {len(value)};")
+            lines.append(f"enum class {camel_case(name)[:-1]} : int {{ {entries} }};")
         elif isinstance(value, type):
             places = {column: place.start for column, place in layout.columns(value).items()}
             lines.append(f"struct {name} {{")

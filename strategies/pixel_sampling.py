@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from turbogs_plugin.engine import engine_of
-from turbogs_plugin.engine.layout import UNITS
+from turbogs_plugin.engine.layout import SAMPLE_UNITS
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, require
@@ -103,7 +103,7 @@ class ErrorGuidedPixelSampler(RulePixelSampler):
         allowed = f"between 0 and 1 - hard_ratio ({1 - self.hard_ratio:g})"
         require(0 <= self.stable_ratio <= 1 - self.hard_ratio + 1e-9, "stable_ratio", self.stable_ratio, allowed)
         require(self.mixed in ("error_age", "uniform"), "mixed", self.mixed, "error_age or uniform")
-        require(self.unit in UNITS, "unit", self.unit, f"one of {', '.join(UNITS)}")
+        require(self.unit in SAMPLE_UNITS, "unit", self.unit, f"one of {', '.join(SAMPLE_UNITS)}")
         require(0 <= self.importance <= 1, "importance", self.importance, "between 0 and 1")
         _require_divisor(self.multiple)
 
@@ -126,7 +126,7 @@ class RandomPixelSampler(RulePixelSampler):
     multiple: int = 1
 
     def __post_init__(self) -> None:
-        require(self.unit in UNITS, "unit", self.unit, f"one of {', '.join(UNITS)}")
+        require(self.unit in SAMPLE_UNITS, "unit", self.unit, f"one of {', '.join(SAMPLE_UNITS)}")
         _require_divisor(self.multiple)
 
     @property

@@ -33,7 +33,7 @@ class DrawEnds:
     """`PixelSamples.host_ends` of a draw whose sizes the host knows. Equal draws have equal ends.
 
     Args:
-        unit: unit of the draw, one of `layout.UNITS`.
+        unit: unit of the draw, one of `layout.SAMPLE_UNITS`.
         sizes: K times (width, height).
         wanted: K times the units drawn of a view's tiles, or of each of its tiles.
         live: K times the tiles that are drawn from, where these are not all tiles: each then has as many slots as a

@@ -23,7 +23,7 @@
 #include <type_traits>
 #include <vector>
 
-#include "common/sizes.h"
+#include "common/batch.h"
 #include "launches.h"
 
 // Absent from a torch without CUDA; the library must load there all the same.
@@ -55,13 +55,6 @@ inline void check_launched(cudaError_t error, const char* what) {
     STD_TORCH_CHECK(error == cudaSuccess, "turbogs: ", what, ": ", cudaGetErrorString(error));
 }
 
-// A value of an enumeration of layout.h, whose entries are numbered from 0. `allowed` names them.
-template <class Enumeration>
-Enumeration to_enumeration(int64_t value, int count, const char* allowed) {
-    STD_TORCH_CHECK(value >= 0 && value < count, "turbogs: ", allowed);
-    return static_cast<Enumeration>(value);
-}
-
 // What a tensor holds whose memory a kernel takes as `T*`: numbers of T, or what T is made of. A uint16_t has the
 // bits of a half; structs are made of floats.
 template <class T>
@@ -91,10 +84,6 @@ public:
 
     Arguments(const TensorList& tensors, const IntegerList& integers, const RealList& reals, const IntegerList& rows)
         : tensors_(tensors), integers_(integers), reals_(reals), rows_(rows) {
-        STD_TORCH_CHECK(tensors.size() == Launch::kNumTensors && integers.size() == Launch::kNumIntegers &&
-                            reals.size() == Launch::kNumReals,
-                        "turbogs: ", Launch::kName, " takes ", Launch::kNumTensors, " tensors, ", Launch::kNumIntegers,
-                        " integers and ", Launch::kNumReals, " reals");
         const Tensor& first = tensor(Tensors{});
         STD_TORCH_CHECK(first.is_cuda(), "turbogs: expected CUDA tensors");
         device_ = first.get_device_index();
@@ -113,6 +102,10 @@ public:
         STD_TORCH_CHECK(has(field), "turbogs: ", Launch::kName, " needs ", name(field));
         return *tensors_[static_cast<size_t>(field)];
     }
+
+    // The tensors of a field `list[Tensor]` in Python, which follow the others: number, and field of each.
+    int64_t num_more() const { return static_cast<int64_t>(tensors_.size() - Launch::kNumTensors); }
+    static Tensors more(int64_t place) { return static_cast<Tensors>(Launch::kNumTensors + place); }
 
     int64_t integer(Integers field) const { return integers_[static_cast<size_t>(field)]; }
     double real(Reals field) const { return reals_[static_cast<size_t>(field)]; }
@@ -137,9 +130,12 @@ public:
                           value.is_contiguous() && value.dim() == static_cast<int64_t>(shape.size()) &&
                           std::equal(shape.begin(), shape.end(), value.sizes().begin());
         if (!fits) {
+            const int64_t* sizes = value.sizes().data();
+            const int device = value.is_cuda() ? static_cast<int>(value.get_device_index()) : -1;
             STD_TORCH_CHECK(false, "turbogs: ", name(field), " must be a contiguous ",
-                            torch::headeronly::toString(type), " ", text(shape),
-                            " tensor on cuda:", static_cast<int>(device_), ", got ", describe(value));
+                            describe(type, shape.begin(), shape.size(), device_), ", got a ",
+                            value.is_contiguous() ? "" : "not contiguous ",
+                            describe(value.scalar_type(), sizes, value.dim(), device));
         }
         pointer = static_cast<T*>(value.data_ptr());
         STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(pointer) % alignment == 0, "turbogs: ", name(field),
@@ -172,27 +168,15 @@ public:
     }
 
 private:
-    static const char* name(Tensors field) { return Launch::kTensorNames[static_cast<size_t>(field)]; }
-
-    template <class Sizes>
-    static std::string text(const Sizes& sizes) {
-        std::ostringstream out;
-        out << "[";
-        bool first = true;
-        for (const int64_t size : sizes) {
-            out << (first ? "" : ", ") << size;
-            first = false;
-        }
-        out << "]";
-        return out.str();
+    static const char* name(Tensors field) {
+        return field < more(0) ? Launch::kTensorNames[static_cast<size_t>(field)] : "memory of a process";
     }
 
-    static std::string describe(const Tensor& tensor) {
+    static std::string describe(ScalarType type, const int64_t* sizes, int64_t count, int device) {
         std::ostringstream out;
-        out << torch::headeronly::toString(tensor.scalar_type()) << " " << text(tensor.sizes()) << " on "
-            << (tensor.is_cuda() ? "cuda:" + std::to_string(static_cast<int>(tensor.get_device_index()))
-                                 : "another kind of device")
-            << (tensor.is_contiguous() ? "" : ", not contiguous");
+        out << torch::headeronly::toString(type) << " tensor [";
+        for (int64_t i = 0; i < count; ++i) out << (i > 0 ? ", " : "") << sizes[i];
+        out << "] on " << (device < 0 ? "another kind of device" : "cuda:" + std::to_string(device));
         return out.str();
     }
 
@@ -213,6 +197,83 @@ void read_origin(const Arguments<Launch>& in, int& x, int& y) {
                     "turbogs: the grid's origin must be 0 .. ", kTileSize - 1, ", got ", origin_x, ", ", origin_y);
     x = static_cast<int>(origin_x);
     y = static_cast<int>(origin_y);
+}
+
+// Reads Python's `Background`, whose fields `Launch` has.
+template <class Launch>
+void read_background(const Arguments<Launch>& in, float (&background)[3]) {
+    using R = typename Launch::Reals;
+    background[0] = in.number(R::background_red);
+    background[1] = in.number(R::background_green);
+    background[2] = in.number(R::background_blue);
+}
+
+// Reads Python's `Scene`, whose fields `Launch` has.
+template <class Launch>
+void read_scene(const Arguments<Launch>& in, SceneParams& scene) {
+    using T = typename Launch::Tensors;
+    const Tensor &means = in.tensor(T::means), &shN = in.tensor(T::shN);
+    STD_TORCH_CHECK(means.dim() == 2 && shN.dim() == 3, "turbogs: means must be [N, 3], shN [N, B, 3]");
+    const int64_t views = in.num_rows(ImageRow::kSize), count = means.size(0), bands = shN.size(1);
+    const int64_t sh_degree = in.integer(Launch::Integers::sh_degree);
+    STD_TORCH_CHECK(sh_degree >= 0 && sh_degree <= kMaxShDegree, "turbogs: sh_degree must be 0 .. ", kMaxShDegree,
+                    ", got ", sh_degree);
+    STD_TORCH_CHECK(bands >= (sh_degree + 1) * (sh_degree + 1) - 1, "turbogs: shN holds ", bands,
+                    " bands, too few for sh_degree ", sh_degree);
+    to_int(views * count, "views * Gaussians");
+    scene.num_views = to_int(views, "views");
+    scene.num_gaussians = to_int(count, "Gaussians");
+    scene.sh_degree = static_cast<int>(sh_degree);
+    scene.bands = to_int(bands, "bands");
+    scene.eps2d = in.number(Launch::Reals::eps2d);
+    in.set(scene.means, T::means, {count, 3});
+    in.set(scene.quats, T::quats, {count, 4});
+    in.set(scene.scales, T::scales, {count, 3});
+    in.set(scene.opacities, T::opacities, {count});
+    in.set(scene.sh0, T::sh0, {count, 1, 3});
+    in.set_quads(scene.shN, T::shN, {count, bands, 3});
+    const Tensor& viewmats = in.tensor(T::viewmats);
+    STD_TORCH_CHECK(viewmats.dim() == 3, "turbogs: viewmats must be [C, 4, 4]");
+    const int64_t cameras = viewmats.size(0);
+    in.set(scene.viewmats, T::viewmats, {cameras, 4, 4});
+    in.set(scene.intrinsics, T::Ks, {cameras, 3, 3});
+    for (int64_t view = 0; view < views; ++view) {
+        const int64_t* row = in.row(view, ImageRow::kSize);
+        const int64_t width = row[ImageRow::kWidth], height = row[ImageRow::kHeight], camera = row[ImageRow::kCamera];
+        check_size(view, width, height);
+        STD_TORCH_CHECK(camera >= 0 && camera < cameras, "turbogs: camera ", camera, " of view ", view,
+                        " is not one of ", cameras);
+        scene.widths[view] = static_cast<int>(width);
+        scene.heights[view] = static_cast<int>(height);
+        scene.camera_rows[view] = to_int(camera, "cameras");
+    }
+}
+
+// Fills `views` of a launcher's parameters, and counts them, from rows of `row_size` numbers, which begin as `ViewRow`
+// does. `pixels`: of all training views, or -1 where nothing is read at flat pixels.
+template <class Launch, class Params>
+void read_views(const Arguments<Launch>& in, int row_size, int64_t pixels, Params& params) {
+    int num_tiles = 0, origin_x = 0, origin_y = 0;
+    read_origin(in, origin_x, origin_y);
+    params.num_views = static_cast<int>(in.num_rows(row_size));
+    for (int i = 0; i < params.num_views; ++i) {
+        const int64_t* row = in.row(i, row_size);
+        const int64_t width = row[ViewRow::kWidth], height = row[ViewRow::kHeight];
+        check_size(i, width, height);
+        SampleView& view = params.views[i];
+        view.pixel_base = row[ViewRow::kFirstPixel];
+        view.width = static_cast<int>(width);
+        view.height = static_cast<int>(height);
+        view.view_number = to_int(row[ViewRow::kNumber], "view number");
+        view.origin_x = origin_x;
+        view.origin_y = origin_y;
+        view.tiles_x = tiles_along(origin_x + view.width);
+        view.tiles_y = tiles_along(origin_y + view.height);
+        view.tile_base = num_tiles;
+        num_tiles += view.tiles_x * view.tiles_y;
+        STD_TORCH_CHECK(pixels < 0 || (view.pixel_base >= 0 && view.pixel_base + width * height <= pixels),
+                        "turbogs: view ", view.view_number, " lies outside the photos or maps");
+    }
 }
 
 }  // namespace turbogs

@@ -11,9 +11,11 @@ std::string architectures() { return TURBOGS_ARCHITECTURES; }
 // (turbogs_plugin/engine/cuda/library.py).
 std::string interface() { return launches::kInterface; }
 
+// Runs a launch. An error of any kernel or call of CUDA in it stays until it is looked for here.
 template <class Launch>
 void call(const TensorList& tensors, const IntegerList& integers, const RealList& reals, const IntegerList& rows) {
     Launch::run({tensors, integers, reals, rows});
+    check_launched(cudaGetLastError(), Launch::kName);
 }
 
 // Defines an operator for each launch. Any of its tensors may be written to.

@@ -1,6 +1,5 @@
 // The kernels of the rasterizer as torch operators; see arguments.h.
 #include "bindings/arguments.h"
-#include "bindings/views.h"
 #include "raster/raster_params.h"
 
 namespace turbogs {
@@ -23,9 +22,7 @@ ForwardParams read_forward(const Arguments<Launch>& in) {
     params.alpha_min = in.number(R::alpha_min);
     params.alpha_max = in.number(R::alpha_max);
     params.transmittance_min = in.number(R::transmittance_min);
-    params.background[0] = in.number(R::background_red);
-    params.background[1] = in.number(R::background_green);
-    params.background[2] = in.number(R::background_blue);
+    read_background(in, params.background);
     in.set_structs(params.cameras, T::cameras, num_views);
     in.set_optional(params.tile_ids, T::tile_ids, {num_active});
     in.set(params.tile_offsets, T::tile_offsets, {num_active + 1});
@@ -73,7 +70,7 @@ void launches::RasterProject::run(const Arguments<RasterProject>& in) {
     in.set(params.radii, Tensors::radii, {views, count, 2});
     in.set(params.tile_differences, Tensors::tile_cursors, {params.num_active + 1});
     in.set_optional(params.records, Tensors::records, {total, ScreenRecord::kSize});
-    check_launched(launch_projection(params, in.stream()), "projection");
+    launch_projection(params, in.stream());
 }
 
 void launches::RasterCountIntersections::run(const Arguments<RasterCountIntersections>& in) {
@@ -88,7 +85,7 @@ void launches::RasterCountIntersections::run(const Arguments<RasterCountIntersec
     in.set(params.status, Tensors::status, {2});
     in.set(params.counters, Tensors::counters, {2}, ScalarType::Int);
     in.set(params.block_sums, Tensors::block_sums, {scan_blocks(params.num_active), 2});
-    check_launched(launch_count_intersections(params, in.stream()), "count of intersections");
+    launch_count_intersections(params, in.stream());
 }
 
 void launches::RasterSortIntersections::run(const Arguments<RasterSortIntersections>& in) {
@@ -115,12 +112,12 @@ void launches::RasterSortIntersections::run(const Arguments<RasterSortIntersecti
     in.set(params.runs, Tensors::runs, {capacity / kLeastOfRun, 2});
     in.set_quads(params.intersection_ids, Tensors::intersection_ids, {capacity});
     params.windows = reinterpret_cast<uint2*>(params.intersection_ids);
-    check_launched(launch_scatter_intersections(params, in.stream()), "scatter of intersections");
-    check_launched(launch_sort_intersections(params, in.stream()), "sort of intersections");
+    launch_scatter_intersections(params, in.stream());
+    launch_sort_intersections(params, in.stream());
 }
 
 void launches::RasterForward::run(const Arguments<RasterForward>& in) {
-    check_launched(launch_rasterize_forward(read_forward(in), in.stream()), "forward");
+    launch_rasterize_forward(read_forward(in), in.stream());
 }
 
 void launches::RasterBackward::run(const Arguments<RasterBackward>& in) {
@@ -129,30 +126,25 @@ void launches::RasterBackward::run(const Arguments<RasterBackward>& in) {
                     "turbogs: depth gradients without depths");
     BackwardParams params = {};
     params.forward = read_forward(in);
-    params.num_instances = to_int(total, "views * Gaussians");
     params.with_density_sums = in.integer(Integers::with_density_sums) != 0;
-    params.cleared = in.integer(Integers::cleared) != 0;
     in.set(params.color_gradients, Tensors::color_gradients, {num_slots, 3});
     in.set_optional(params.alpha_gradients, Tensors::alpha_gradients, {num_slots});
     in.set_optional(params.depth_gradients, Tensors::depth_gradients, {num_slots});
     in.set_optional(params.pixel_errors, Tensors::pixel_errors, {num_slots});
     in.set_quads(params.records, Tensors::records, {total, ScreenRecord::kSize});
-    check_launched(launch_rasterize_backward(params, in.stream()), "backward");
+    launch_rasterize_backward(params, in.stream());
 }
 
 void launches::CollectRecords::run(const Arguments<CollectRecords>& in) {
-    constexpr Tensors kRecords[kMaxPeers] = {Tensors::records_0, Tensors::records_1, Tensors::records_2,
-                                             Tensors::records_3, Tensors::records_4, Tensors::records_5,
-                                             Tensors::records_6, Tensors::records_7};
-    constexpr Tensors kRadii[kMaxPeers] = {Tensors::radii_0, Tensors::radii_1, Tensors::radii_2, Tensors::radii_3,
-                                           Tensors::radii_4, Tensors::radii_5, Tensors::radii_6, Tensors::radii_7};
-    const Tensor &source = in.tensor(Tensors::radii_0), &target = in.tensor(Tensors::target_radii);
+    const int64_t num_sources = in.num_rows(1);
+    STD_TORCH_CHECK(num_sources <= kMaxPeers && in.num_more() == 2 * num_sources,
+                    "turbogs: records and radii of up to ", kMaxPeers, " processes are collected");
+    const Tensor &source = in.tensor(in.more(1)), &target = in.tensor(Tensors::target_radii);
     STD_TORCH_CHECK(source.dim() == 3 && target.dim() == 3, "turbogs: radii must be [views, Gaussians, 2]");
     const int64_t count = source.size(1), all = target.size(0), rows = target.size(1);
-    const int64_t first_row = in.integer(Integers::first_row), num_sources = in.num_rows(1);
+    const int64_t first_row = in.integer(Integers::first_row);
     STD_TORCH_CHECK(first_row >= 0 && first_row + rows <= count, "turbogs: rows ", first_row, " .. ", first_row + rows,
                     " of ", count);
-    STD_TORCH_CHECK(num_sources <= kMaxPeers, "turbogs: records of up to ", kMaxPeers, " processes are collected");
     CollectParams params = {};
     params.num_sources = static_cast<int>(num_sources);
     params.num_views = to_int(all, "views");
@@ -162,33 +154,31 @@ void launches::CollectRecords::run(const Arguments<CollectRecords>& in) {
     const auto whole = ScreenRecord::kSize;
     int64_t end = 0;  // of the views so far
     for (int i = 0; i < params.num_sources; ++i) {
-        const int64_t views = in.tensor(kRadii[i]).size(0), first = *in.row(i, 1);
+        const int64_t views = in.tensor(in.more(2 * i + 1)).size(0), first = *in.row(i, 1);
         STD_TORCH_CHECK(views > 0 && (first == end || (i > 0 && first == end - 1)),
                         "turbogs: the views of a process begin with the last one of the process before, or the next");
         end = first + views;
         params.sources[i].num_views = to_int(views, "views");
         params.sources[i].first_view = to_int(first, "views");
-        in.set(params.sources[i].records, kRecords[i], {views, count, whole});
-        in.set(params.sources[i].radii, kRadii[i], {views, count, 2});
+        in.set(params.sources[i].records, in.more(2 * i), {views, count, whole});
+        in.set(params.sources[i].radii, in.more(2 * i + 1), {views, count, 2});
     }
     STD_TORCH_CHECK(end == all && all <= kMaxViews, "turbogs: records of ", end, " views of ", all);
     in.set(params.target_records, Tensors::target_records, {all, rows, whole});
     in.set(params.target_radii, Tensors::target_radii, {all, rows, 2});
-    check_launched(launch_collect_records(params, in.stream()), "collection of records");
+    launch_collect_records(params, in.stream());
 }
 
 void launches::GatherColors::run(const Arguments<GatherColors>& in) {
-    constexpr Tensors kPeers[kMaxPeers] = {Tensors::peer_0, Tensors::peer_1, Tensors::peer_2, Tensors::peer_3,
-                                           Tensors::peer_4, Tensors::peer_5, Tensors::peer_6, Tensors::peer_7};
     GatherParams params = {};
     const int64_t num_peers = in.num_rows(1), first = in.integer(Integers::first);
-    STD_TORCH_CHECK(num_peers <= kMaxPeers && first >= PassStatus::kSize, "turbogs: up to ", kMaxPeers,
-                    " processes gather colours, which begin behind their status");
+    STD_TORCH_CHECK(num_peers <= kMaxPeers && in.num_more() == num_peers && first >= PassStatus::kSize,
+                    "turbogs: up to ", kMaxPeers, " processes gather colours, which begin behind their status");
     params.num_peers = static_cast<int>(num_peers);
     params.first = to_int(first, "numbers of a memory");
     int64_t numbers = 0;
     for (int i = 0; i < params.num_peers; ++i) {
-        const Tensors peer = kPeers[i];
+        const Tensors peer = in.more(i);
         const int64_t size = in.tensor(peer).numel(), samples = *in.row(i, 1);
         STD_TORCH_CHECK(samples >= 0 && samples <= (size - first) / 3, "turbogs: process ", i, " has no ", samples,
                         " colours in memory for ", size, " numbers");
@@ -200,7 +190,7 @@ void launches::GatherColors::run(const Arguments<GatherColors>& in) {
     in.set(params.colors, Tensors::colors, {numbers / 3, 3});
     in.set(params.seen, Tensors::seen, {2});
     in.set_optional(params.overflow, Tensors::overflow, {1});
-    check_launched(launch_gather_colors(params, in.stream()), "gathering of colours");
+    launch_gather_colors(params, in.stream());
 }
 
 }  // namespace turbogs

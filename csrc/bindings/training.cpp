@@ -3,8 +3,6 @@
 #include <cmath>
 
 #include "bindings/arguments.h"
-#include "bindings/views.h"
-#include "exposure/exposure_params.h"
 #include "loss/loss_params.h"
 #include "optimizer/optimizer_params.h"
 #include "sampling/sampling_params.h"
@@ -28,8 +26,7 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
         tiles += count;
     }
     params.num_tiles = to_int(tiles, "tiles");
-    params.unit = to_enumeration<SampleUnit>(in.integer(Integers::unit), kNumSampleUnits,
-                                             "unit must be 0 (pixel) or 1 (tile)");
+    params.unit = static_cast<SampleUnit>(in.integer(Integers::unit));
     STD_TORCH_CHECK(params.unit == SampleUnit::kTile || chosen == tiles,
                     "turbogs: tile_ids must have an entry for each tile");
     const bool at_origin = params.views[0].origin_x == 0 && params.views[0].origin_y == 0;
@@ -63,15 +60,7 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
         in.set(params.tile_keys, Tensors::tile_keys, {tiles});
         in.set(params.tile_missed, Tensors::tile_missed, {tiles});
     }
-    check_launched(launch_sample_pixels(params, in.stream()), "pixel sampler");
-}
-
-void launches::CountFilled::run(const Arguments<CountFilled>& in) {
-    CountFilledParams params = {};
-    params.num_slots = to_int(in.tensor(Tensors::pixel_ids).numel(), "samples");
-    in.set(params.pixel_ids, Tensors::pixel_ids, {params.num_slots});
-    in.set(params.num_filled, Tensors::num_filled, {1});
-    check_launched(launch_count_filled(params, in.stream()), "count of samples");
+    launch_sample_pixels(params, in.stream());
 }
 
 void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
@@ -90,8 +79,7 @@ void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
     read_views(in, ViewRow::kSize, has_maps ? map_pixels : photo_pixels, params);
     params.num_tiles = to_int(tiles, "tiles");
     params.num_slots = to_int(slots, "samples");
-    params.structure = to_enumeration<Structure>(in.integer(Integers::structure), kNumStructures,
-                                                 "structure must be 0 .. 3: none, ncc, ssim or printed_ncc");
+    params.structure = static_cast<Structure>(in.integer(Integers::structure));
     params.epsilon = in.number(Reals::epsilon);
     params.l1_weight = in.number(Reals::l1_weight);
     params.structure_weight = in.number(Reals::structure_weight);
@@ -105,9 +93,7 @@ void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
     in.set_optional(params.targets, Tensors::targets, {slots, 3});
     in.set_optional(params.photos, Tensors::photos, {photo_pixels, channels});
     params.channels = static_cast<int>(channels);
-    params.background[0] = in.number(Reals::background_red);
-    params.background[1] = in.number(Reals::background_green);
-    params.background[2] = in.number(Reals::background_blue);
+    read_background(in, params.background);
     if (has_maps) {
         const int64_t num_views = in.tensor(Tensors::view_sums).numel();
         in.set(params.errors, Tensors::errors, {map_pixels});
@@ -127,7 +113,7 @@ void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
     in.set(params.pixel_errors, Tensors::pixel_errors, {slots});
     in.set_optional(params.nonfinite_losses, Tensors::nonfinite_losses, {});
     in.set_optional(params.overflow, Tensors::overflow, {1});
-    check_launched(launch_sparse_loss(params, in.stream()), "sparse loss");
+    launch_sparse_loss(params, in.stream());
 }
 
 namespace {
@@ -175,7 +161,7 @@ void launches::ProjectionBackward::run(const Arguments<ProjectionBackward>& in) 
     in.set(outputs.shN, Tensors::shN_gradients, {count, params.bands, 3});
     in.set(outputs.touched, Tensors::touched, {count});
     in.set(outputs.view_losses, Tensors::view_losses, {num_rows, count});
-    check_launched(launch_projection_backward(params, outputs, in.stream()), "projection backward");
+    launch_projection_backward(params, outputs, in.stream());
 }
 
 void launches::FusedStep::run(const Arguments<FusedStep>& in) {
@@ -183,8 +169,7 @@ void launches::FusedStep::run(const Arguments<FusedStep>& in) {
     const int64_t count = params.num_gaussians, harmonics = 3 * params.bands;
     const double beta1 = in.real(Reals::beta1), beta2 = in.real(Reals::beta2);
     OptimizerParams optimizer = {};
-    optimizer.kind = to_enumeration<UpdateKind>(in.integer(Integers::kind), kNumUpdateKinds,
-                                                "kind must be 0 (Adam), 1 (balanced LM) or 2 (paper's LM)");
+    optimizer.kind = static_cast<UpdateKind>(in.integer(Integers::kind));
     optimizer.rows_per_view = in.integer(Integers::rows_per_view) != 0;
     const auto set_rates = [&](int first, int size, Reals rate) {
         std::fill_n(optimizer.rates + first, size, in.number(rate));
@@ -223,7 +208,7 @@ void launches::FusedStep::run(const Arguments<FusedStep>& in) {
     in.set_quads(optimizer.exp_avg_sq_shN, Tensors::exp_avg_sq_shN, {count, harmonics});
     in.set(optimizer.steps, Tensors::steps, {count});
     in.set(optimizer.skipped, Tensors::skipped, {});
-    check_launched(launch_fused_step(params, optimizer, in.stream()), "fused step");
+    launch_fused_step(params, optimizer, in.stream());
 }
 
 template <class Params>
@@ -255,7 +240,7 @@ void launches::ExposeColors::run(const Arguments<ExposeColors>& in) {
     ExposeColorsParams params = {};
     const int64_t slots = read_exposed(in, params);
     in.set(params.exposed, Tensors::exposed, {slots, 3});
-    check_launched(launch_expose_colors(params, in.stream()), "exposures");
+    launch_expose_colors(params, in.stream());
 }
 
 void launches::ExposureBackward::run(const Arguments<ExposureBackward>& in) {
@@ -263,7 +248,7 @@ void launches::ExposureBackward::run(const Arguments<ExposureBackward>& in) {
     const int64_t slots = read_exposed(in, params);
     in.set(params.gradients, Tensors::gradients, {slots, 3});
     in.set(params.sums, Tensors::sums, {params.num_views, 3, 4});
-    check_launched(launch_exposure_backward(params, in.stream()), "gradients of exposures");
+    launch_exposure_backward(params, in.stream());
 }
 
 void launches::ExposureStep::run(const Arguments<ExposureStep>& in) {
@@ -283,7 +268,7 @@ void launches::ExposureStep::run(const Arguments<ExposureStep>& in) {
     params.rate = in.number(Reals::rate);
     params.eps = in.number(Reals::eps);
     params.pull = in.number(Reals::pull);
-    check_launched(launch_exposure_step(params, in.stream()), "step of exposures");
+    launch_exposure_step(params, in.stream());
 }
 
 }  // namespace turbogs

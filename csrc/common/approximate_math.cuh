@@ -1,8 +1,7 @@
 // Functions that need not be correctly rounded, from the special function unit of the GPU. Precision is chosen here and
 // nowhere else. Relative errors are about 2^-22.
-//
-// A build with TURBOGS_EXACT_MATH=1 has correctly rounded functions in their place, to measure what they cost: 6 to
-// 19 % of a forward and backward pass, at no error that shows beside float32's own.
+// Correctly rounded functions would cost 6 to 19 % of a forward and backward pass, at no error that shows beside
+// float32's own.
 #pragma once
 
 #include <cfloat>
@@ -12,38 +11,28 @@
 namespace turbogs {
 
 // The body of each. A macro, as the instruction of inline PTX is a literal.
-#if TURBOGS_EXACT_MATH
-#define TURBOGS_APPROXIMATE(exact, instruction) return exact(x)
-#else
-#define TURBOGS_APPROXIMATE(exact, instruction)          \
+#define TURBOGS_APPROXIMATE(instruction)                 \
     float result;                                        \
     asm(instruction " %0, %1;" : "=f"(result) : "f"(x)); \
     return result
-#endif
 
 // 2^x. A denormal result is zero.
-__device__ __forceinline__ float approximate_exp2(float x) { TURBOGS_APPROXIMATE(exp2f, "ex2.approx.ftz.f32"); }
+__device__ __forceinline__ float approximate_exp2(float x) { TURBOGS_APPROXIMATE("ex2.approx.ftz.f32"); }
 
 // Absolute error 2^-22 within 0.5 .. 2, else relative.
-__device__ __forceinline__ float approximate_log2(float x) { TURBOGS_APPROXIMATE(log2f, "lg2.approx.ftz.f32"); }
+__device__ __forceinline__ float approximate_log2(float x) { TURBOGS_APPROXIMATE("lg2.approx.ftz.f32"); }
 
 // 1 / x. Denormal input is zero and gives infinity.
-__device__ __forceinline__ float approximate_reciprocal(float x) {
-    TURBOGS_APPROXIMATE(__frcp_rn, "rcp.approx.ftz.f32");
-}
+__device__ __forceinline__ float approximate_reciprocal(float x) { TURBOGS_APPROXIMATE("rcp.approx.ftz.f32"); }
 
 // 1 / sqrt(x). Denormal input is zero and gives infinity.
-__device__ __forceinline__ float approximate_rsqrt(float x) {
-    TURBOGS_APPROXIMATE(__frsqrt_rn, "rsqrt.approx.ftz.f32");
-}
+__device__ __forceinline__ float approximate_rsqrt(float x) { TURBOGS_APPROXIMATE("rsqrt.approx.ftz.f32"); }
 
 // sqrt(x); of 0 it is 0. Denormal input counts.
-__device__ __forceinline__ float approximate_sqrt(float x) { TURBOGS_APPROXIMATE(__fsqrt_rn, "sqrt.approx.f32"); }
+__device__ __forceinline__ float approximate_sqrt(float x) { TURBOGS_APPROXIMATE("sqrt.approx.f32"); }
 
 // sqrt(x), faster: denormal input is zero.
-__device__ __forceinline__ float approximate_sqrt_flushed(float x) {
-    TURBOGS_APPROXIMATE(__fsqrt_rn, "sqrt.approx.ftz.f32");
-}
+__device__ __forceinline__ float approximate_sqrt_flushed(float x) { TURBOGS_APPROXIMATE("sqrt.approx.ftz.f32"); }
 
 #undef TURBOGS_APPROXIMATE
 

@@ -1,7 +1,7 @@
 // Real spherical harmonics up to degree 3 (Sloan, JCGT 2013), in gsplat's order and signs, and their gradient.
 #pragma once
 
-#include "common/sizes.h"
+#include "common/batch.h"
 
 namespace turbogs {
 

@@ -1,11 +1,7 @@
 // Lanes of a warp and sums over them.
 #pragma once
 
-#include <cuda_runtime.h>
-
-#include <cstdint>
-
-#include "common/sizes.h"
+#include "common/batch.h"
 
 namespace turbogs {
 

@@ -6,34 +6,16 @@
 // has variance 0 exactly. The second makes the variances, a third the norms that the balance needs, and the last writes
 // the gradient. The sums of the views add half-precision numbers in double, which is exact in any order. SSIM has many
 // windows in a tile, and a kernel of its own after this one, window_similarity.cu.
-#include <algorithm>
 #include <cfloat>
 
 #include <cuda_fp16.h>
 
 #include "common/approximate_math.cuh"
-#include "common/tiles.cuh"
 #include "common/warp.cuh"
 #include "loss/sample_loss.cuh"
 
 namespace turbogs {
 namespace {
-
-// How many slots of a batch are filled, where a sampler leaves some empty: losses are means over those. A thread takes
-// kThreadSlots slots or more, and warps add up what their lanes found.
-// No record of other values: the launch is small.
-constexpr int kCountThreads = 256;
-constexpr int kThreadSlots = 4;
-constexpr int kCountBlocks = 512;  // at most; of larger batches a thread takes more slots
-
-__global__ void __launch_bounds__(kCountThreads) count_filled_kernel(const __grid_constant__ CountFilledParams params) {
-    int mine = 0;
-    for (int i = blockIdx.x * kCountThreads + threadIdx.x; i < params.num_slots; i += gridDim.x * kCountThreads) {
-        mine += params.pixel_ids[i] >= 0;
-    }
-    const uint32_t total = __reduce_add_sync(kFullWarp, static_cast<uint32_t>(mine));
-    if (this_lane() == 0 && total != 0u) atomicAdd(params.num_filled, static_cast<int32_t>(total));
-}
 
 constexpr int kLossThreads = 128;  // of a block: four tiles, which mostly share a view's sum; no record of other values
 constexpr int kLossBlocks = 7;     // of an SM: 72 registers. With 64 it spills, and with 80 it is no faster
@@ -294,20 +276,11 @@ void launch(const SparseLossParams& params, cudaStream_t stream) {
 
 }  // namespace
 
-cudaError_t launch_count_filled(const CountFilledParams& params, cudaStream_t stream) {
-    if (params.num_slots == 0) return cudaSuccess;
-    const int blocks = std::min(blocks_for(params.num_slots, kThreadSlots * kCountThreads), kCountBlocks);
-    count_filled_kernel<<<blocks, kCountThreads, 0, stream>>>(params);
-    return cudaGetLastError();
-}
-
-cudaError_t launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
-    if (params.num_slots == 0 || params.num_tiles == 0) return cudaSuccess;
+void launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
+    if (params.num_slots == 0 || params.num_tiles == 0) return;
     if (params.photos != nullptr && params.channels == 4) launch<true>(params, stream);
     else launch<false>(params, stream);
-    const cudaError_t error = cudaGetLastError();
-    if (error != cudaSuccess || params.structure != Structure::kSsim) return error;
-    return launch_window_similarity(params, stream);
+    if (params.structure == Structure::kSsim) launch_window_similarity(params, stream);
 }
 
 }  // namespace turbogs

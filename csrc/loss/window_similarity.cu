@@ -6,7 +6,6 @@
 // through them, and from these three terms of the gradient, which a window gives to its pixels as it took theirs: the
 // Gaussian is symmetric. Means are relative to the tile's first sample. A place without a sample has weight 0. All of a
 // tile stays in shared memory: a sample's colour and truth are read once, its gradient is read and written once.
-#include "common/tiles.cuh"
 #include "common/warp.cuh"
 #include "loss/sample_loss.cuh"
 
@@ -161,7 +160,7 @@ __global__ void __launch_bounds__(kWindowThreads)
         const float covariance = fminf(fmaxf(moments[4] - mean_x * mean_y, -largest), largest);
         // So that a window which seems to have no variance beside colours of thousands has no slope of rounding.
         const float steady = kSsimConstant + kRounding * (moments[2] + moments[3]);
-        const LuminanceSimilarity similarity =
+        const Similarity similarity =
             ssim(mean_x + first_x, mean_y + first_y, variance_x, variance_y, covariance, steady);
         if (weight > 0.0f) missing += 1.0f - similarity.value;
 
@@ -193,13 +192,10 @@ __global__ void __launch_bounds__(kWindowThreads)
 
 }  // namespace
 
-cudaError_t launch_window_similarity(const SparseLossParams& params, cudaStream_t stream) {
-    if (params.photos != nullptr && params.channels == 4) {
-        window_similarity_kernel<true><<<params.num_tiles, kWindowThreads, 0, stream>>>(params);
-    } else {
-        window_similarity_kernel<false><<<params.num_tiles, kWindowThreads, 0, stream>>>(params);
-    }
-    return cudaGetLastError();
+void launch_window_similarity(const SparseLossParams& params, cudaStream_t stream) {
+    const bool alpha = params.photos != nullptr && params.channels == 4;
+    const auto kernel = alpha ? window_similarity_kernel<true> : window_similarity_kernel<false>;
+    kernel<<<params.num_tiles, kWindowThreads, 0, stream>>>(params);
 }
 
 }  // namespace turbogs

@@ -220,15 +220,12 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
 
 // Launches a kernel whose threads have `work_floats` each in `BlockShared::work`.
 template <class Second>
-cudaError_t launch_blocks(void (*kernel)(ScreenBackwardParams, Second), int work_floats,
-                          const ScreenBackwardParams& params, const Second& second, cudaStream_t stream) {
+void launch_blocks(void (*kernel)(ScreenBackwardParams, Second), int work_floats, const ScreenBackwardParams& params,
+                   const Second& second, cudaStream_t stream) {
     const size_t bytes = BlockShared::bytes(params, work_floats);
-    const cudaError_t status =
-        cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes));
-    if (status != cudaSuccess) return status;
+    cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(bytes));
     const int blocks = blocks_for(params.num_gaussians, kBackwardThreads);
     kernel<<<blocks, kBackwardThreads, bytes, stream>>>(params, second);
-    return cudaGetLastError();
 }
 
 }  // namespace turbogs

@@ -305,20 +305,19 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
 }
 
 template <bool kCopied>
-cudaError_t launch(const ScreenBackwardParams& params, const OptimizerParams& optimizer, cudaStream_t stream) {
+void launch(const ScreenBackwardParams& params, const OptimizerParams& optimizer, cudaStream_t stream) {
     const auto kernel = optimizer.kind == UpdateKind::kAdam ? fused_step_kernel<Rows::kNone, kCopied>
                         : optimizer.rows_per_view           ? fused_step_kernel<Rows::kPerView, kCopied>
                                                             : fused_step_kernel<Rows::kSummed, kCopied>;
-    return launch_blocks(kernel, step_floats(params), params, optimizer, stream);
+    launch_blocks(kernel, step_floats(params), params, optimizer, stream);
 }
 
 }  // namespace
 
-cudaError_t launch_fused_step(const ScreenBackwardParams& params, const OptimizerParams& optimizer,
-                              cudaStream_t stream) {
-    if (params.num_gaussians == 0) return cudaSuccess;
-    return optimizer.num_copies > 0 ? launch<true>(params, optimizer, stream)
-                                    : launch<false>(params, optimizer, stream);
+void launch_fused_step(const ScreenBackwardParams& params, const OptimizerParams& optimizer, cudaStream_t stream) {
+    if (params.num_gaussians == 0) return;
+    if (optimizer.num_copies > 0) launch<true>(params, optimizer, stream);
+    else launch<false>(params, optimizer, stream);
 }
 
 }  // namespace turbogs

@@ -2,12 +2,7 @@
 // turbogs_plugin/types: K views of the batch, N Gaussians, P sample slots, B harmonics above band 0.
 #pragma once
 
-#include <cuda_runtime.h>
-
-#include <cstdint>
-
-#include "common/sizes.h"
-#include "common/views.h"
+#include "common/batch.h"
 
 namespace turbogs {
 
@@ -67,10 +62,9 @@ struct OptimizerParams {
     unsigned long long* skipped;  // [] Gaussians left out because of a non-finite gradient
 };
 
-// Every launcher returns the first CUDA error, and only enqueues work on `stream`.
-cudaError_t launch_projection_backward(const ScreenBackwardParams& params, const ProjectionBackwardOutputs& outputs,
-                                       cudaStream_t stream);
-cudaError_t launch_fused_step(const ScreenBackwardParams& params, const OptimizerParams& optimizer,
-                              cudaStream_t stream);
+// A launcher only enqueues work on `stream`; `call` in bindings/library.cpp looks for its errors.
+void launch_projection_backward(const ScreenBackwardParams& params, const ProjectionBackwardOutputs& outputs,
+                                cudaStream_t stream);
+void launch_fused_step(const ScreenBackwardParams& params, const OptimizerParams& optimizer, cudaStream_t stream);
 
 }  // namespace turbogs

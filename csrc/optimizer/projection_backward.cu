@@ -116,11 +116,11 @@ __global__ void __launch_bounds__(kBackwardThreads) projection_backward_kernel(
 
 }  // namespace
 
-cudaError_t launch_projection_backward(const ScreenBackwardParams& params, const ProjectionBackwardOutputs& outputs,
-                                       cudaStream_t stream) {
-    if (params.num_gaussians == 0) return cudaSuccess;
+void launch_projection_backward(const ScreenBackwardParams& params, const ProjectionBackwardOutputs& outputs,
+                                cudaStream_t stream) {
+    if (params.num_gaussians == 0) return;
     const auto kernel = outputs.per_view ? projection_backward_kernel<true> : projection_backward_kernel<false>;
-    return launch_blocks(kernel, BlockShared::row_stride(params), params, outputs, stream);
+    launch_blocks(kernel, BlockShared::row_stride(params), params, outputs, stream);
 }
 
 }  // namespace turbogs

@@ -113,12 +113,10 @@ __global__ void __launch_bounds__(kScanThreads)
 
 }  // namespace
 
-cudaError_t launch_count_intersections(const CountIntersectionsParams& params, cudaStream_t stream) {
+void launch_count_intersections(const CountIntersectionsParams& params, cudaStream_t stream) {
     const int blocks = scan_blocks(params.num_active);
     sum_tiles_kernel<<<blocks, kScanThreads, 0, stream>>>(params);
-    if (const cudaError_t error = cudaGetLastError()) return error;
     start_tiles_kernel<<<blocks, kScanThreads, 0, stream>>>(params);
-    return cudaGetLastError();
 }
 
 }  // namespace turbogs

@@ -212,13 +212,11 @@ __global__ void __launch_bounds__(kScatterThreads)
 
 }  // namespace
 
-cudaError_t launch_scatter_intersections(const SortIntersectionsParams& params, cudaStream_t stream) {
-    if (params.num_instances == 0 || params.num_active == 0) return cudaSuccess;
+void launch_scatter_intersections(const SortIntersectionsParams& params, cudaStream_t stream) {
+    if (params.num_instances == 0 || params.num_active == 0) return;
     const int blocks = blocks_for(params.num_instances, kScatterInstances);
     scatter_kernel<<<blocks, kScatterThreads, 0, stream>>>(params);
-    if (const cudaError_t error = cudaGetLastError()) return error;
     scatter_windows_kernel<<<kWindowBlocks, kScatterThreads, 0, stream>>>(params);
-    return cudaGetLastError();
 }
 
 }  // namespace turbogs

@@ -5,7 +5,6 @@
 // few swaps of neighbours put them right. A tile with more intersections is cut into runs of kSortRun, each sorted by a
 // warp of its own. A second launch merges the runs with a thread for each key, which finds its place in the other runs
 // by bisection. No two keys are equal, so the order does not depend on the order of arrival.
-#include "common/tiles.cuh"
 #include "common/warp.cuh"
 #include "raster/raster_params.h"
 
@@ -214,14 +213,12 @@ __global__ void __launch_bounds__(kMergeThreads)
 
 }  // namespace
 
-cudaError_t launch_sort_intersections(const SortIntersectionsParams& params, cudaStream_t stream) {
-    if (params.num_active == 0) return cudaSuccess;
+void launch_sort_intersections(const SortIntersectionsParams& params, cudaStream_t stream) {
+    if (params.num_active == 0) return;
     const int run_warps = static_cast<int>(params.capacity / kLeastOfRun);  // no more runs than that
     const int blocks = blocks_for(run_warps + params.num_active, kSortWarps);
     sort_tiles_kernel<<<blocks, kSortWarps * kWarpSize, 0, stream>>>(params, run_warps);
-    if (const cudaError_t error = cudaGetLastError()) return error;
     merge_runs_kernel<<<kMergeBlocks, kMergeThreads, 0, stream>>>(params);
-    return cudaGetLastError();
 }
 
 }  // namespace turbogs

@@ -10,7 +10,6 @@
 #include "common/philox.h"
 #include "common/spherical_harmonics.cuh"
 #include "common/splat_geometry.cuh"
-#include "common/tiles.cuh"
 #include "common/warp.cuh"
 #include "raster/tile_reach.cuh"
 
@@ -273,11 +272,10 @@ __global__ void __launch_bounds__(kProjectionGaussians* kProjectionSlices, kProj
 
 }  // namespace
 
-cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t stream) {
+void launch_projection(const ProjectionParams& params, cudaStream_t stream) {
     const int entries = params.num_tiles + 1 > kMaxViews ? params.num_tiles + 1 : kMaxViews;
     prepare_kernel<<<blocks_for(entries, kPrepareThreads), kPrepareThreads, 0, stream>>>(params);
-    if (const cudaError_t error = cudaGetLastError()) return error;
-    if (params.num_gaussians == 0) return cudaSuccess;
+    if (params.num_gaussians == 0) return;
     const int blocks = blocks_for(params.num_gaussians, kProjectionGaussians);
     int slices = 1;
     while (slices < kProjectionSlices && slices < params.num_views && params.num_gaussians < kEnoughThreads / slices) {
@@ -286,7 +284,6 @@ cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t strea
     const size_t shared = 2 * slices * kProjectionGaussians * sizeof(Queued) + params.num_views * sizeof(RasterCamera) +
                           kProjectionGaussians * 3 * params.bands * sizeof(float);
     projection_kernel<<<blocks, dim3(kProjectionGaussians, slices), shared, stream>>>(params);
-    return cudaGetLastError();
 }
 
 }  // namespace turbogs

@@ -7,19 +7,15 @@
 // tile that it reaches; a pass has room for M of them (its "capacity").
 #pragma once
 
-#include <cuda_runtime.h>
-
 #include <cstddef>
-#include <cstdint>
 
 #include "common/camera.cuh"
 #include "common/philox.h"
-#include "common/sizes.h"
-#include "common/views.h"
+#include "common/batch.h"
 
 namespace turbogs {
 
-// A tile with more than kSortRun intersections has at least kLeastOfRun for each of its runs, so this bounds their number.
+// A tile with more than kSortRun intersections has at least kLeastOfRun for each of its runs: a bound of their number.
 constexpr int kLeastOfRun = kSortRun / 2;
 
 // One view as the kernels read it. Written by the projection's launcher.
@@ -44,16 +40,10 @@ struct alignas(16) Instance {
     float red, green, blue;  // after the clamp at 0
     float inverse_sigma_y;   // 1 / standard deviation along y
 };
-#define TURBOGS_SAME_PLACE(member, column) \
-    static_assert(offsetof(Instance, member) == InstanceRow::column * sizeof(float), "as layout.py has it")
-TURBOGS_SAME_PLACE(x, kMean);
-TURBOGS_SAME_PLACE(conic_a, kConic);
-TURBOGS_SAME_PLACE(opacity, kOpacity);
-TURBOGS_SAME_PLACE(depth, kDepth);
-TURBOGS_SAME_PLACE(log_reach, kLogReach);
-TURBOGS_SAME_PLACE(red, kColor);
-TURBOGS_SAME_PLACE(inverse_sigma_y, kInverseSigmaY);
-#undef TURBOGS_SAME_PLACE
+static_assert(offsetof(Instance, conic_a) == sizeof(float) * InstanceRow::kConic &&
+                  offsetof(Instance, opacity) == sizeof(float) * InstanceRow::kOpacity &&
+                  offsetof(Instance, depth) == sizeof(float) * InstanceRow::kDepth,
+              "as layout.py has it");
 static_assert(sizeof(Instance) == InstanceRow::kSize * sizeof(float), "as layout.py has it");
 
 // Stage 1. K views of every Gaussian; parameters are read once.
@@ -144,14 +134,12 @@ struct ForwardParams {
 // Stage 6. Same work items; gradients on the screen.
 struct BackwardParams {
     ForwardParams forward;         // as given to stage 5; its outputs are inputs here
-    int num_instances;
     bool with_density_sums;        // fill what density control asks for: absolute, distance and square sums; else zeros
-    bool cleared;                  // `records` are zero where the radius is not 0
     const float* color_gradients;  // [P, 3]
     const float* alpha_gradients;  // [P] or null
     const float* depth_gradients;  // [P] or null
     const float* pixel_errors;     // [P] or null
-    float* records;                // [K, N, 16] out, ScreenRecord; off screen zero, or where `cleared`, left alone
+    float* records;                // [K, N, 16] added to, ScreenRecord
 };
 
 // What a process has rendered of a batch: V views of N Gaussians.
@@ -185,14 +173,14 @@ struct GatherParams {
     int32_t* overflow;               // [1] out, or null: kOverflow of any
 };
 
-// Every launcher returns the first CUDA error, and only enqueues work on `stream`.
-cudaError_t launch_projection(const ProjectionParams& params, cudaStream_t stream);
-cudaError_t launch_count_intersections(const CountIntersectionsParams& params, cudaStream_t stream);
-cudaError_t launch_scatter_intersections(const SortIntersectionsParams& params, cudaStream_t stream);
-cudaError_t launch_sort_intersections(const SortIntersectionsParams& params, cudaStream_t stream);
-cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream);
-cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream);
-cudaError_t launch_collect_records(const CollectParams& params, cudaStream_t stream);
-cudaError_t launch_gather_colors(const GatherParams& params, cudaStream_t stream);
+// A launcher only enqueues work on `stream`; `call` in bindings/library.cpp looks for its errors.
+void launch_projection(const ProjectionParams& params, cudaStream_t stream);
+void launch_count_intersections(const CountIntersectionsParams& params, cudaStream_t stream);
+void launch_scatter_intersections(const SortIntersectionsParams& params, cudaStream_t stream);
+void launch_sort_intersections(const SortIntersectionsParams& params, cudaStream_t stream);
+void launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream);
+void launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream);
+void launch_collect_records(const CollectParams& params, cudaStream_t stream);
+void launch_gather_colors(const GatherParams& params, cudaStream_t stream);
 
 }  // namespace turbogs

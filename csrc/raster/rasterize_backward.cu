@@ -309,20 +309,14 @@ __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_consta
 
 }  // namespace
 
-cudaError_t launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream) {
-    if (params.num_instances == 0) return cudaSuccess;
-    const size_t bytes = sizeof(float) * ScreenRecord::kSize * static_cast<size_t>(params.num_instances);
-    if (!params.cleared) {
-        if (const cudaError_t error = cudaMemsetAsync(params.records, 0, bytes, stream)) return error;
-    }
+void launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream) {
     const int items = params.forward.num_active * params.forward.chunks;
-    if (items == 0) return cudaSuccess;
+    if (items == 0) return;
     const bool density = params.with_density_sums;
     const auto kernel = params.depth_gradients != nullptr
                             ? (density ? backward_kernel<true, true> : backward_kernel<true, false>)
                             : (density ? backward_kernel<false, true> : backward_kernel<false, false>);
     kernel<<<items, kWarpSize, 0, stream>>>(params);
-    return cudaGetLastError();
 }
 
 }  // namespace turbogs

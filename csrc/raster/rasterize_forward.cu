@@ -189,14 +189,13 @@ __global__ void __launch_bounds__(kForwardWarps* kWarpSize, forward_blocks(kItem
 
 }  // namespace
 
-cudaError_t launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream) {
-    if (params.num_active * params.chunks == 0) return cudaSuccess;
+void launch_rasterize_forward(const ForwardParams& params, cudaStream_t stream) {
+    if (params.num_active * params.chunks == 0) return;
     const bool even = params.chunks % 2 == 0;
     const auto kernel = params.depths != nullptr ? (even ? forward_kernel<2, true> : forward_kernel<1, true>)
                                                  : (even ? forward_kernel<2, false> : forward_kernel<1, false>);
     const int warps = params.num_active * (even ? params.chunks / 2 : params.chunks);
     kernel<<<blocks_for(warps, kForwardWarps), kForwardWarps * kWarpSize, 0, stream>>>(params);
-    return cudaGetLastError();
 }
 
 }  // namespace turbogs

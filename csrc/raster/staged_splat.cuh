@@ -11,7 +11,6 @@
 #pragma once
 
 #include "common/approximate_math.cuh"
-#include "common/tiles.cuh"
 #include "common/warp.cuh"
 #include "raster/raster_params.h"
 

@@ -68,12 +68,11 @@ void launch(const SamplePixelsParams& params, cudaStream_t stream) {
 
 }  // namespace
 
-cudaError_t launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream) {
-    if (params.num_tiles == 0) return cudaSuccess;
+void launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream) {
+    if (params.num_tiles == 0) return;
     if (params.unit == SampleUnit::kTile) return launch_sample_tiles(params, stream);
     if (params.live_tiles != nullptr) launch<true>(params, stream);
     else launch<false>(params, stream);
-    return cudaGetLastError();
 }
 
 }  // namespace turbogs

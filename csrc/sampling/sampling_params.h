@@ -2,13 +2,8 @@
 // batch, P sample slots, T tiles with samples, X flat pixels of all training views.
 #pragma once
 
-#include <cuda_runtime.h>
-
-#include <cstdint>
-
 #include "common/philox.h"
-#include "common/sizes.h"
-#include "common/views.h"
+#include "common/batch.h"
 
 namespace turbogs {
 
@@ -55,8 +50,8 @@ struct SamplePixelsParams {
     float* tile_missed;   // [tiles]
 };
 
-// Every launcher returns the first CUDA error, and only enqueues work on `stream`.
-cudaError_t launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream);
-cudaError_t launch_sample_tiles(const SamplePixelsParams& params, cudaStream_t stream);  // unit tile
+// A launcher only enqueues work on `stream`; `call` in bindings/library.cpp looks for its errors.
+void launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream);
+void launch_sample_tiles(const SamplePixelsParams& params, cudaStream_t stream);  // unit tile
 
 }  // namespace turbogs

@@ -5,7 +5,6 @@
 
 #include <cuda_fp16.h>
 
-#include "common/tiles.cuh"
 #include "common/warp.cuh"
 #include "sampling/sampling_params.h"
 

@@ -168,19 +168,17 @@ __global__ void __launch_bounds__(kSampleThreads) fill_tiles_kernel(const __grid
 }
 
 template <bool kMasked>
-cudaError_t launch(const SamplePixelsParams& params, cudaStream_t stream) {
+void launch(const SamplePixelsParams& params, cudaStream_t stream) {
     tile_sums_kernel<kMasked><<<warp_blocks(params.num_tiles), kSampleThreads, 0, stream>>>(params);
-    if (const cudaError_t error = cudaGetLastError()) return error;
     choose_tiles_kernel<<<params.num_views, kChooseThreads, 0, stream>>>(params);
-    if (const cudaError_t error = cudaGetLastError()) return error;
     fill_tiles_kernel<kMasked><<<warp_blocks(params.num_chosen), kSampleThreads, 0, stream>>>(params);
-    return cudaGetLastError();
 }
 
 }  // namespace
 
-cudaError_t launch_sample_tiles(const SamplePixelsParams& params, cudaStream_t stream) {
-    return params.live_tiles != nullptr ? launch<true>(params, stream) : launch<false>(params, stream);
+void launch_sample_tiles(const SamplePixelsParams& params, cudaStream_t stream) {
+    if (params.live_tiles != nullptr) launch<true>(params, stream);
+    else launch<false>(params, stream);
 }
 
 }  // namespace turbogs

@@ -14,7 +14,7 @@ from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda.engine import CudaEngine
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
-from turbogs_plugin.engine.reference.records import collect_records, gather_colors
+from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, ScreenRecords
 from turbogs_plugin.engine.shared import PassMemory, SharedEngine
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
@@ -48,7 +48,7 @@ def test_records_on_screen_are_those_of_the_twin_to_the_bit(count, rows, views):
     before = target.records.clone()
     firsts = [first for first, _ in views]
     CudaEngine().collect(sources, firsts, target, rows[0])
-    collect_records(sources, firsts, wanted, rows[0])
+    ReferenceEngine().collect(sources, firsts, wanted, rows[0])
     assert torch.equal(target.radii, wanted.radii)
     seen = (wanted.radii > 0).any(dim=-1)
     assert bool(seen.any()) or rows[1] - rows[0] == 1
@@ -188,7 +188,7 @@ def test_colours_gathered_are_those_of_the_twin(counts):
         statuses[-1][PassStatus.OVERFLOW], statuses[0][PassStatus.STOP] = overflow, stop
         engine, seen, wanted = CudaEngine(GPU), *torch.full((2, 2), -1, dtype=torch.int32, device=GPU)
         colors = engine.gather(parts, first, counts, seen)
-        assert torch.equal(colors, gather_colors(parts, first, counts, wanted))
+        assert torch.equal(colors, ReferenceEngine().gather(parts, first, counts, wanted))
         assert seen.tolist() == wanted.tolist() == [overflow, stop] and engine.overflow.tolist() == [overflow]
     with pytest.raises(RuntimeError, match="process 0 has no"):
         CudaEngine(GPU).gather(parts, first, (max(counts) + 1, *counts[1:]), seen)

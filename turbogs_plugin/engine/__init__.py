@@ -12,11 +12,11 @@ from pathlib import Path
 
 import torch
 
-from turbogs_plugin.engine.base import BaseEngine
 from turbogs_plugin.engine.cuda import library
 from turbogs_plugin.engine.cuda.engine import CudaEngine
 from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
+from turbogs_plugin.engine.shared import SharedEngine
 
 __all__ = ["CompiledKernels", "Engine", "compiled_kernels", "engine_of"]
 
@@ -41,7 +41,7 @@ def compiled_kernels() -> CompiledKernels:
     return CompiledKernels(library.library_path(), library.architectures(), library.unavailable_reason())
 
 
-def engine_of(device: torch.device, for_training: bool = False) -> BaseEngine:
+def engine_of(device: torch.device, for_training: bool = False) -> SharedEngine:
     """The engine for tensors on a device: the kernels where they are compiled and run, else the torch reference.
 
     A warning says why, where a GPU has to do without the kernels.

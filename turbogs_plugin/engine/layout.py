@@ -26,7 +26,7 @@ SCAN_TILES = 1024
 SORT_RUN = 512
 """Intersections of a tile that one warp sorts. A tile with more is sorted in runs of this length, which are merged."""
 
-UNITS = ("pixel", "tile")
+SAMPLE_UNITS = ("pixel", "tile")
 """Units of a draw: pixels, or whole tiles of 16x16. The kernels number them in this order."""
 
 STRUCTURES = ("none", "ncc", "ssim", "printed_ncc")

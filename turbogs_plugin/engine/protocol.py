@@ -1,8 +1,7 @@
 """The interface of an engine, which does all computation of a training on its device.
 
-A trainer needs no more than `Engine`. `engine.base` has the defaults, `engine.reference` the definition of every
-result, `engine.cuda` its twin; `distributed.ranks_engine` is an engine of several GPUs around one of these, which it
-needs to be a `engine.shared.SharedEngine`.
+A trainer needs no more than `Engine`. `engine.shared` has the defaults, `engine.reference` the definition of every
+result, `engine.cuda` its twin; `distributed.ranks_engine` is an engine of several GPUs around one of these.
 """
 
 from __future__ import annotations

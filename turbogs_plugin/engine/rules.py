@@ -28,7 +28,7 @@ class DrawRule:
     """Draw of an iteration's samples (paper section 3.5); `engine.reference.draws` defines the draw.
 
     Args:
-        unit: one of `layout.UNITS`.
+        unit: one of `layout.SAMPLE_UNITS`.
         hard, stable: shares of the units drawn by error and by age; the mixed stage draws the rest.
         mixed_uniform: the mixed stage ignores error and age.
         importance: a of the weights ``p^-a``; 0 for no weights.

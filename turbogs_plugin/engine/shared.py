@@ -1,4 +1,4 @@
-"""What an engine offers to another one that trains with several GPUs, of which each has such an engine.
+"""An engine on one device, with the defaults in torch, and what it offers to an engine of several GPUs around it.
 
 A process renders its share of a batch; what its passes leave lies in memory that other processes read (`PassMemory`),
 and its step may change their copies of the model too (`ModelCopies`).
@@ -7,20 +7,25 @@ and its step may change their copies of the model too (`ModelCopies`).
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any
 
+import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.layout import PassStatus
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.protocol import Engine
+from turbogs_plugin.engine.protocol import Engine, GroundTruth, MapUpdate
+from turbogs_plugin.engine.reference.exposed_colors import expose, exposure_gradients, step_exposures
+from turbogs_plugin.engine.reference.records import collect_records, gather_colors
+from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients, ScreenRecords
-from turbogs_plugin.engine.rules import UpdateRule
+from turbogs_plugin.engine.rules import LossTerms, UpdateRule
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples
+from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate
 
 
 @dataclass
@@ -74,8 +79,117 @@ class ModelCopies:
         return tuple(distance for each in found for distance in each)
 
 
-class SharedEngine(Engine, Protocol):
-    """An engine whose passes and steps can be put together with other engines' of its kind."""
+class SharedEngine(Engine):
+    """An engine on one device, without what each engine does in its own way: draw, render, evaluate, go back from the
+    screen (`screen_gradients`), and recover. Passes and steps can be put together with other engines' of its kind."""
+
+    @property
+    def overflow(self) -> Tensor | None:
+        return None
+
+    @property
+    def bytes_held(self) -> int:
+        return 0
+
+    def supervise(self, terms: LossTerms, colors: Tensor, truth: GroundTruth, update: MapUpdate) -> LossOutput:
+        return self.evaluate_and_learn(terms, colors, truth.colors(), truth.samples, update)
+
+    def evaluate_and_learn(
+        self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
+    ) -> LossOutput:
+        output = self.evaluate(terms, colors, targets, samples)
+        self.learn(samples, colors, output, update)
+        return output
+
+    def learn(self, samples: PixelSamples, colors: Tensor, output: LossOutput, update: MapUpdate) -> None:
+        drawn, nonfinite = torch.isfinite(colors).all(dim=1), ~output.loss.isfinite()
+        if self.overflow is not None:
+            drawn, nonfinite = drawn & (self.overflow == 0), nonfinite & (self.overflow[0] == 0)
+        update.maps.update(samples, torch.where(drawn, output.pixel_errors, torch.nan), update.step)
+        if update.nonfinite_losses is not None:
+            update.nonfinite_losses.add_(nonfinite)
+
+    def expose(self, exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
+        return expose(exposures, colors, samples)
+
+    def learn_exposures(
+        self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
+    ) -> Tensor:
+        of_colors, sums = exposure_gradients(exposures, colors, gradients, samples)
+        step_exposures(exposures, sums, samples.view_ids, rate, self.overflow)
+        return of_colors
+
+    def update(
+        self,
+        rule: UpdateRule,
+        screen: ScreenGradients,
+        gaussians: Gaussians,
+        moments: GaussianMoments,
+        stats: GaussianStats | None,
+        copies: ModelCopies | None = None,
+    ) -> None:
+        """`Engine.update`. `copies`: of `gaussians`, to be changed alike."""
+        apply_update(rule, gaussians, screen.parameter_gradients(rule.per_view, stats), moments)
+        for copy in copies.copies if copies else ():
+            for name, value in copy.items():
+                value.copy_(getattr(gaussians, name))
+
+    def settle(self, wait: bool = False) -> int:
+        return 0
+
+    def place(self, gaussians: Gaussians) -> Gaussians:
+        return gaussians
+
+    def each_view(self, errors_of: Callable[[int], Tensor], pixels: Sequence[int]) -> Iterator[Tensor]:
+        return map(errors_of, range(len(pixels)))
+
+    def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
+        """Every row is always valid here."""
+
+    def agreed(self, update: RowUpdate | None) -> RowUpdate | None:
+        return update
+
+    def verify(self, state: Callable[[], dict[str, Any]]) -> None:
+        """There is one state."""
+
+    def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
+        """Collect the records of all K views for some rows. What several processes have of one view is added up, in
+        their order.
+
+        Args:
+            sources: of each process with views, in their order: of V views and N Gaussians; maybe other devices'
+                memory, read in place.
+            views: first view of each, in the batch: the last one of the process before, or the next.
+            target: of K views and M Gaussians; overwritten, but for records that are off screen.
+            row: first of the M among the N.
+        """
+        collect_records(sources, views, target, row)
+
+    def lend(self, memory: PassMemory | None) -> bool:
+        """Let the following passes keep in this memory what it is for, as far as it fits in. None: in the engine's own.
+
+        Returns:
+            Whether they do. False here: no memory is kept from pass to pass.
+        """
+        return False
+
+    def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
+        """Put the colours of all processes together. If one has set `PassStatus.OVERFLOW`, so does `overflow` here.
+
+        Args:
+            parts: [.] float32 of each process, memory that begins with the bits of its `PassStatus`; maybe other
+                devices' memory, read in place.
+            first: number at which its colours begin, in each.
+            counts: samples of each.
+            seen: [2] int32, written: the largest `PassStatus.OVERFLOW` of all, and the largest `PassStatus.STOP`.
+
+        Returns:
+            [P, 3] float32, one process's after the other's; valid until the next call.
+        """
+        colors = gather_colors(parts, first, counts, seen)
+        if self.overflow is not None:
+            self.overflow.copy_(seen[:1])
+        return colors
 
     @abstractmethod
     def screen_gradients(
@@ -93,50 +207,6 @@ class SharedEngine(Engine, Protocol):
             cameras, samples, options: of all K views, as the passes had them together.
             plain: of these views and Gaussians.
         """
-
-    def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
-        """Collect the records of all K views for some rows. What several processes have of one view is added up, in
-        their order.
-
-        Args:
-            sources: of each process with views, in their order: of V views and N Gaussians; maybe other devices'
-                memory, read in place.
-            views: first view of each, in the batch: the last one of the process before, or the next.
-            target: of K views and M Gaussians; overwritten, but for records that are off screen.
-            row: first of the M among the N.
-        """
-
-    def lend(self, memory: PassMemory | None) -> bool:
-        """Let the following passes keep in this memory what it is for, as far as it fits in. None: in the engine's own.
-
-        Returns:
-            Whether they do. False for an engine that keeps no memory from pass to pass.
-        """
-
-    def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
-        """Put the colours of all processes together. If one has set `PassStatus.OVERFLOW`, so does `overflow` here.
-
-        Args:
-            parts: [.] float32 of each process, memory that begins with the bits of its `PassStatus`; maybe other
-                devices' memory, read in place.
-            first: number at which its colours begin, in each.
-            counts: samples of each.
-            seen: [2] int32, written: the largest `PassStatus.OVERFLOW` of all, and the largest `PassStatus.STOP`.
-
-        Returns:
-            [P, 3] float32, one process's after the other's; valid until the next call.
-        """
-
-    def update(
-        self,
-        rule: UpdateRule,
-        screen: ScreenGradients,
-        gaussians: Gaussians,
-        moments: GaussianMoments,
-        stats: GaussianStats | None,
-        copies: ModelCopies | None = None,
-    ) -> None:
-        """`Engine.update`. `copies`: of `gaussians`, to be changed alike."""
 
     @abstractmethod
     def recover(self) -> None:

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine import layout
-from turbogs_plugin.engine.base import BaseEngine
 from turbogs_plugin.engine.cuda import launches, library, training
 from turbogs_plugin.engine.cuda.raster import (
     Buffers,
@@ -22,11 +20,11 @@ from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, RenderOptions, ScreenRecords
 from turbogs_plugin.engine.rules import LossTerms
-from turbogs_plugin.engine.shared import PassMemory
+from turbogs_plugin.engine.shared import PassMemory, SharedEngine
 from turbogs_plugin.types import BLACK, Cameras, Gaussians, LossOutput, PixelSamples
 
 
-class CudaEngine(BaseEngine):
+class CudaEngine(SharedEngine):
     """`Engine` on one CUDA device, on torch's current stream, float32.
 
     Args:
@@ -63,8 +61,7 @@ class CudaEngine(BaseEngine):
 
     def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
         arrays = [array for source in sources for array in (source.records, source.radii)]
-        padded = launches.Sources(*arrays, *(None,) * (2 * layout.MAX_PEERS - len(arrays)))
-        library.launch(launches.CollectRecords(target.records, target.radii, padded, list(views), row))
+        library.launch(launches.CollectRecords(target.records, target.radii, list(views), row, arrays))
 
     def lend(self, memory: PassMemory | None) -> bool:
         if self.workspace is not None:
@@ -73,9 +70,8 @@ class CudaEngine(BaseEngine):
 
     def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
         def arguments(buffers: Buffers, *_: int) -> launches.GatherColors:
-            peers = launches.Peers(*parts, *(None,) * (layout.MAX_PEERS - len(parts)))
             colors = buffers.floats("gathered_colors", sum(counts), 3)
-            return launches.GatherColors(peers, list(counts), first, colors, seen, self.overflow)
+            return launches.GatherColors(colors, list(counts), first, seen, self.overflow, list(parts))
 
         places = [part.data_ptr() for part in (*parts, seen)]
         launch = Buffers(self.workspace, seen.device).kept("gather", arguments, first, *counts, *places)

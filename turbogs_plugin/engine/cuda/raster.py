@@ -151,9 +151,7 @@ def count_filled(samples: PixelSamples) -> Tensor | None:
     if not samples.has_empty_slots:
         return None
     if samples.num_filled is None:
-        count = torch.zeros(1, dtype=torch.int32, device=samples.pixel_ids.device)
-        library.launch(launches.CountFilled(pixel_ids=samples.pixel_ids, num_filled=count))
-        samples.num_filled = count
+        samples.num_filled = (samples.pixel_ids >= 0).sum(dtype=torch.int32).reshape(1)
     return samples.num_filled
 
 
@@ -198,10 +196,9 @@ class CudaRendered(Rendered):
                 raise InputError(f"{name} must be {wanted}, got {value.dtype} {list(value.shape)} on {value.device}")
         buffers = Buffers(self._workspace, self.colors.device)
         records = buffers.floats("records", len(self._forward.instances), ScreenRecord.SIZE)
-        backward = launches.RasterBackward(
-            self._forward, upstream.contiguous(), records, with_density_sums=with_statistics, cleared=self._cleared
-        )
-        library.launch(backward)
+        if not self._cleared:
+            records.zero_()
+        library.launch(launches.RasterBackward(self._forward, upstream.contiguous(), records, with_statistics))
         self._cleared = False
         overflow = None if self._workspace is None else self._workspace.overflow
         records = records.view(*self._radii.shape[:2], ScreenRecord.SIZE)

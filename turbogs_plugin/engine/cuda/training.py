@@ -22,7 +22,7 @@ from turbogs_plugin.engine.cuda import launches, library
 from turbogs_plugin.engine.cuda.raster import CudaScreenGradients, count_filled, plain_floats, require_views
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.exposures import BETA1, BETA2, EPSILON, PULL, Exposures
-from turbogs_plugin.engine.layout import MAX_PEERS, STRUCTURES, UNITS, UPDATE_KINDS
+from turbogs_plugin.engine.layout import MAX_PEERS, SAMPLE_UNITS, STRUCTURES, UPDATE_KINDS
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.render_pass import ScreenGradients
@@ -70,7 +70,7 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         stamps=maps.stamps,
         views=view_rows(maps.offsets[views].tolist(), shapes, view_ids, places.draws),
         grid=launches.GridOrigin(*origin),
-        unit=UNITS.index(rule.unit),
+        unit=SAMPLE_UNITS.index(rule.unit),
         masks=masks,
         slots_per_tile=places.slots_per_tile,
         mixed_uniform=rule.mixed_uniform,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from turbogs_plugin.engine.base import BaseEngine
 from turbogs_plugin.engine.reference.draws import draw_pixels
 from turbogs_plugin.engine.reference.losses import sparse_loss
 from turbogs_plugin.engine.reference.raster import rasterize_reference, screen_gradients
+from turbogs_plugin.engine.shared import SharedEngine
 
 
-class ReferenceEngine(BaseEngine):
+class ReferenceEngine(SharedEngine):
     """`Engine` in torch. It keeps nothing between calls and never loses an iteration."""
 
     draw = staticmethod(draw_pixels)

@@ -17,7 +17,6 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from .base import LAUNCHES, Launch, field_types, fields_of, nested_type
-from .peers import CollectRecords, GatherColors, Peers, Sources
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,7 +51,7 @@ else:  # the fields that launches read of these
     MapArrays = fields_of(Tensor="errors stamps view_sums")  # [X] float16, [X] int16, [V] float64
     ExposureArrays = fields_of(Tensor="offsets exp_avg exp_avg_sq steps")
 
-__all__ = ["LAUNCHES", "CollectRecords", "GatherColors", "Launch", "Peers", "Sources", "field_types", "nested_type"]
+__all__ = ["LAUNCHES", "Launch", "field_types", "nested_type"]
 
 NO_STATS: Any = SimpleNamespace(**dict.fromkeys(StatSums.__annotations__))
 NO_MASKS: Any = SimpleNamespace(**dict.fromkeys(MaskArrays.__annotations__))
@@ -199,9 +198,8 @@ class RasterBackward(Launch):
 
     forward: RasterForward  # the pass's own launch
     upstream: Upstream  # [P, 3] and [P] float32; depth gradients only of a pass with depths
-    records: Tensor  # [K * N, 16] float32
+    records: Tensor  # [K * N, 16] float32, zero on screen
     with_density_sums: bool  # fill the columns that only density control asks for
-    cleared: bool  # the records on screen are zero already
 
 
 @dataclass
@@ -271,7 +269,7 @@ class SamplePixels(Launch):
     stamps: Tensor  # [X] int16
     views: list[int]  # [K] layout.DrawRow
     grid: GridOrigin
-    unit: int  # of layout.UNITS
+    unit: int  # of layout.SAMPLE_UNITS
     masks: MaskArrays
     slots_per_tile: int  # slots of a tile that the image's edge does not cut; with masks, of every tile
     mixed_uniform: bool
@@ -284,14 +282,6 @@ class SamplePixels(Launch):
     tile_offsets: Tensor  # [T + 1] int32
     weights: Tensor | None  # [P] float32; None without importance
     scratch: TileScratch
-
-
-@dataclass
-class CountFilled(Launch):
-    """Add the number of filled slots to `num_filled`."""
-
-    pixel_ids: Tensor  # [P] int32
-    num_filled: Tensor  # [1] int32
 
 
 @dataclass
@@ -359,3 +349,31 @@ class ExposureStep(Launch):
     beta2: float
     eps: float
     pull: float
+
+
+@dataclass
+class CollectRecords(Launch):
+    """Copy the records of splats on screen from all processes' views to those of the batch, for a run of rows; and the
+    radii. What several processes have of one view is added up. M rows."""
+
+    target_records: Tensor  # [K, M, 16] float32, layout.ScreenRecord; where off screen, left alone
+    target_radii: Tensor  # [K, M, 2] int32
+    first_views: list[int]  # [sources] of the batch; a process begins with the last view of the one before, or the next
+    first_row: int  # of the sources
+    sources: list[
+        Tensor
+    ]  # records and radii of each process with views, as of N Gaussians; maybe in other GPUs' memory
+
+
+@dataclass
+class GatherColors(Launch):
+    """Put the colours of all processes together, and look at their flags."""
+
+    colors: Tensor  # [P, 3] float32
+    counts: list[int]  # [processes] samples of each
+    first: int  # number at which colours begin, in each process's memory
+    seen: Tensor  # [2] int32: the largest of two flags
+    overflow: Tensor | None  # [1] int32, set like the first of these
+    peers: list[
+        Tensor
+    ]  # [.] float32 of each process: memory, maybe another GPU's, that begins with a layout.PassStatus

@@ -20,7 +20,8 @@ class Launch:
 
     Attributes:
         operator: name of the operator: the class's name in snake case.
-        paths: dotted paths of the fields in each of the four lists, in order.
+        paths: dotted paths of the fields in each of the four lists, in order. The tensors of a field ``list[Tensor]``,
+            of which a launch has one at most, follow all other tensors.
     """
 
     operator: ClassVar[str]
@@ -30,8 +31,11 @@ class Launch:
     def __init_subclass__(cls) -> None:
         cls.operator = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
         cls.paths = _paths(cls)
+        tensors, integers, reals = map(_reader, cls.paths[:3])
+        for name in (name for name, kind in field_types(cls).items() if kind == "list[Tensor]"):
+            tensors = _joined(tensors, attrgetter(name))
         rows = cls.paths[3]
-        cls._readers = *map(_reader, cls.paths[:3]), attrgetter(*rows) if rows else _reader(rows)
+        cls._readers = tensors, integers, reals, attrgetter(*rows) if rows else _reader(rows)
         LAUNCHES.append(cls)
 
     def lists(self) -> tuple[tuple, tuple, tuple, tuple]:
@@ -64,7 +68,7 @@ def _paths(cls: type, prefix: str = "") -> tuple[list[str], list[str], list[str]
     for name, annotation in field_types(cls).items():
         if annotation in KINDS:
             paths[KINDS[annotation]].append(prefix + name)
-        else:
+        elif annotation != "list[Tensor]":
             for mine, nested in zip(paths, _paths(nested_type(cls, annotation), f"{prefix}{name}."), strict=True):
                 mine.extend(nested)
     return paths
@@ -76,3 +80,7 @@ def _reader(paths: list[str]) -> Callable[[Any], tuple]:
         return attrgetter(*paths)
     read = attrgetter(paths[0]) if paths else None
     return lambda launch: () if read is None else (read(launch),)
+
+
+def _joined(first: Callable[[Any], tuple], second: Callable[[Any], list]) -> Callable[[Any], tuple]:
+    return lambda launch: (*first(launch), *second(launch))

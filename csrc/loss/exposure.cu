@@ -5,9 +5,8 @@
 // other and adds up in registers, so that few atomics are left. The step is one block: a warp for each of the 12
 // numbers of a map, so that the mean over all photos needs no second launch.
 #include "common/approximate_math.cuh"
-#include "common/tiles.cuh"
 #include "common/warp.cuh"
-#include "exposure/exposure_params.h"
+#include "loss/loss_params.h"
 
 namespace turbogs {
 namespace {
@@ -158,22 +157,19 @@ __global__ void __launch_bounds__(kStepThreads)
 
 }  // namespace
 
-cudaError_t launch_expose_colors(const ExposeColorsParams& params, cudaStream_t stream) {
-    if (params.num_tiles == 0) return cudaSuccess;
+void launch_expose_colors(const ExposeColorsParams& params, cudaStream_t stream) {
+    if (params.num_tiles == 0) return;
     expose_colors_kernel<<<blocks_for(params.num_tiles, kExposureWarps), kExposureThreads, 0, stream>>>(params);
-    return cudaGetLastError();
 }
 
-cudaError_t launch_exposure_backward(const ExposureBackwardParams& params, cudaStream_t stream) {
-    if (params.num_tiles == 0) return cudaSuccess;
+void launch_exposure_backward(const ExposureBackwardParams& params, cudaStream_t stream) {
+    if (params.num_tiles == 0) return;
     const int blocks = blocks_for(params.num_tiles, kExposureWarps * kWarpTiles);
     exposure_backward_kernel<<<blocks, kExposureThreads, 0, stream>>>(params);
-    return cudaGetLastError();
 }
 
-cudaError_t launch_exposure_step(const ExposureStepParams& params, cudaStream_t stream) {
+void launch_exposure_step(const ExposureStepParams& params, cudaStream_t stream) {
     exposure_step_kernel<<<1, kStepThreads, 0, stream>>>(params);
-    return cudaGetLastError();
 }
 
 }  // namespace turbogs
