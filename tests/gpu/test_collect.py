@@ -160,7 +160,7 @@ def in_place_like_twin(
             for _ in range(2)
         )
         memories[rank].collect(engines[rank], shares, parts, plains[rank], target)
-        collect_records(plains, [one.views.start for one in shares], wanted, rows.start)
+        ReferenceEngine().collect(plains, [one.views.start for one in shares], wanted, rows.start)
         assert torch.equal(target.radii, wanted.radii)
         on_screen = (wanted.radii > 0).any(dim=-1)
         assert torch.equal(target.records[on_screen], wanted.records[on_screen])
