@@ -51,8 +51,7 @@ def test_counts_sizes_and_bytes():
     images = [noise(48, 64), noise(48, 80), noise(32, 64), noise(48, 64)]
     facts = gather_facts(scene_of(posed(images, nadir(LINE))), CPU, memory_limit=5)
     pixels = 48 * 64 * 2 + 48 * 80 + 32 * 64
-    assert (facts.train_views, facts.test_views, facts.points) == (4, 4, 81)
-    assert facts.largest_photo == (80, 48)
+    assert facts.train_views == 4
     assert (facts.photo_bytes, facts.map_bytes) == (6 * pixels, 4 * pixels)
     assert (facts.device, facts.memory_limit) == ("cpu", 5)
     assert 0 < facts.device_free_bytes == facts.host_free_bytes
@@ -67,17 +66,6 @@ def test_concentration_of_view_directions(tilt):
         viewmat[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
     facts = gather_facts(scene_of(posed([noise()] * 2, viewmats)), CPU)
     assert facts.direction_concentration == pytest.approx(abs(np.cos(angle)), abs=1e-6)
-
-
-def test_points_that_no_camera_sees_decide_nothing():
-    behind = np.array([[0.0, 0.0, -2.0], [50.0, 0.0, 1.0]])
-    facts = gather_facts(scene_of(posed([noise()] * 4, nadir(LINE)), behind), CPU, with_exposures=True)
-    assert facts.exposure_views == 0 and facts.exposure_spread == facts.exposure_rest == 0.0
-
-
-def test_a_single_view_has_no_neighbour():
-    facts = gather_facts(scene_of(posed([noise()], nadir(LINE[:1]))), CPU, with_exposures=True)
-    assert (facts.exposure_spread, facts.direction_concentration) == (0.0, 1.0)
 
 
 class Work(TorchDispatchMode):
@@ -111,7 +99,9 @@ def test_the_work_is_bounded():
     assert work(1000, 200_000) <= 1.1 * work(200, 20_000)
 
 
-def test_a_scene_without_points_has_a_plan():
-    views = posed([noise(seed=number) for number in range(4)], nadir(LINE))
-    facts = gather_facts(scene_of(views, np.zeros((0, 3))), CPU, with_exposures=True)
-    assert facts.train_views == 4 and facts.exposure_views == 0
+@pytest.mark.parametrize("points", [[], [[0.0, 0.0, -2.0], [50.0, 0.0, 1.0]]], ids=["none", "unseen"])
+@pytest.mark.parametrize("views", [1, 4])
+def test_points_that_no_camera_sees_and_a_single_view_decide_nothing(points, views):
+    train = posed([noise(seed=number) for number in range(views)], nadir(LINE[:views]))
+    facts = gather_facts(scene_of(train, np.reshape(points, (-1, 3))), CPU, with_exposures=True)
+    assert (facts.exposure_views, facts.exposure_spread, facts.exposure_rest) == (0, 0.0, 0.0)

@@ -98,7 +98,7 @@ STAGED = [
 @pytest.mark.parametrize(("hard", "stable", "mixed", "stages"), STAGED)
 def test_pixel_frequencies_are_exact(hard, stable, mixed, stages):
     """1,500 views of 3x2 pixels, 3 drawn of each."""
-    sampler = ErrorGuidedPixelSampler(hard, stable, mixed)
+    sampler = ErrorGuidedPixelSampler(hard_ratio=hard, stable_ratio=stable, mixed=mixed)
     drawn = drawn_units(sampler, 3.5 / 256, 1500, (3, 2), ERRORS, AGES, torch.arange(6))
     assert (drawn.sum(axis=1) == 3).all()
     assert_frequencies(drawn, exact_sets(ERRORS, AGES, stages, mixed == "uniform"))

@@ -270,7 +270,7 @@ def test_one_pixel_a_tile():
 
 def test_ages_past_sixteen_bits_still_rank():
     maps = ErrorMaps.from_images(torch.rand(1, 16, 16))
-    sampler, visited = ErrorGuidedPixelSampler(0.0, 1.0), 60_000
+    sampler, visited = ErrorGuidedPixelSampler(hard_ratio=0.0, stable_ratio=1.0), 60_000
     first = sampler.sample(maps, (0,), 0.5, step(visited))
     maps.update(first, torch.rand(len(first)), step(visited))
     second = sampler.sample(maps, (0,), 0.5, step(visited + 32_766))  # one iteration before the visited saturate

@@ -276,7 +276,7 @@ def test_random_points_are_those_of_a_capture_without_points(capture):
 def test_a_model_gets_no_backdrop_unless_it_is_asked_for(finished, capture):
     config = tiny_config(capture, f"train.init={finished}")
     facts = run.plan_run(tiny_config(capture)).facts
-    assert wanted_backdrop(facts, config).value is False
+    assert wanted_backdrop(facts, config)[0] is False
     model = load_model(finished, CPU).gaussians
     asked = tiny_config(capture, f"train.init={finished}", "train.backdrop=true").without_plan()
     assert len(Trainer(asked, load_scene(capture), CPU).gaussians) == len(model) + 3000

@@ -70,7 +70,7 @@ class RunOptions:
         more = (*settings_of(given), *budget_overrides(self.max_memory, self.time_budget))
         asked = DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *more)
         settings = load_config(*asked)
-        require_one_length(*asked)
+        require_one_length(asked[1])
         if self.max_gaussians is not None:
             settings = with_cap(settings, self.max_gaussians)
         if scene is not None:

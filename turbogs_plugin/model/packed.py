@@ -59,8 +59,9 @@ def read_splat(path: Path) -> Gaussians:
             sh0=(shares[:, :3] - 0.5) / SH_C0,
             shN=np.zeros((len(rows), 0, 3)),
         )
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path} as .splat: {error}; export it again, or name another file") from None
+    except (OSError, ValueError):
+        said = f"{path} cannot be read as a .splat, which is rows of {SPLAT_ROW.itemsize}"
+        raise InputError(f"{said}; export it again, or name another file") from None
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
