@@ -256,7 +256,7 @@ def test_one_hot_tile_always_gives_the_hot_pixel_and_else_is_uniform():
 def test_smallest_error_comes_before_zero_errors():
     errors = torch.zeros(256)
     errors[100:110] = 6e-8
-    counts, _ = many_tiles(errors, sampler=ErrorGuidedPixelSampler(1.0, 0.0))
+    counts, _ = many_tiles(errors, sampler=ErrorGuidedPixelSampler(hard_ratio=1.0, stable_ratio=0.0))
     assert (counts[100:110] == 400).all()
 
 
