@@ -36,14 +36,6 @@ def test_packaged_configurations_are_complete_and_round_trip(name):
         config.build(kind)
 
 
-def test_the_table_of_the_paper():
-    for name, iterations, until in (("turbogs", 5000, 3500), ("turbogs-big", 8000, 6000)):
-        config = load_config(name)
-        assert config.train.refine_until == until * config.train.written_iterations / iterations
-        assert (config.schedule["type"], config.schedule["alpha"], config.maps.beta) == ("sinusoidal", 3.0, 0.4)
-        assert (config.schedule["min_views"], config.schedule["max_views"]) == (3, 10)
-
-
 @pytest.mark.parametrize(
     ("text", "value"), [("1e-4", 1e-4), ("5e-1", 0.5), ("1", 1.0), (".5", 0.5), ("1E-4", 1e-4), ("0.25", 0.25)]
 )

@@ -133,13 +133,6 @@ def test_what_is_set_wins_and_the_plan_says_so(setting, value, changes, holds):
     assert holds(plan.apply(config))
 
 
-def test_the_layer_above_wins_over_auto_and_auto_over_what_is_below(tmp_path):
-    upper = tmp_path / "upper.yaml"
-    upper.write_text("base: turbogs\ntrain: {exposure: auto, batch_for: auto, backdrop: true}\n")
-    config = load_config(str(upper), ["train.batch_for=2"])
-    assert (config.train.batch_for, config.train.backdrop, config.train.exposure) == (2, True, "auto")
-
-
 @pytest.mark.parametrize("name", ["turbogs", "mcmc", "3dgs"])
 def test_a_batch_for_more_processes_is_that_of_one_where_there_is_one(name):
     """With more, views and pixels grow by their number, learning rates by its root, moments forget after as many
