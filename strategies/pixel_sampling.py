@@ -69,13 +69,33 @@ class RulePixelSampler(PixelSampler):
         return engine_of(maps.errors.device).draw(self.rule, maps, view_numbers(view_ids, maps), rate, step)
 
 
-def _require_divisor(multiple: int) -> None:
-    divides = multiple >= 1 and TILE_PIXELS % multiple == 0
-    require(divides, "multiple", multiple, f"a divisor of {TILE_PIXELS}, the pixels of a tile")
+@dataclass
+class RandomPixelSampler(RulePixelSampler):
+    """Uniformly random pixels of each tile (or tiles of each view), without replacement.
+
+    Args:
+        unit: `pixel`, as in the paper, or `tile`: whole tiles of a view, which begin elsewhere in each iteration
+            (`DrawRule.origin`).
+        multiple: samples of a tile are rounded to a multiple of this, where `unit` is `pixel`. The rasterizer takes 32
+            samples at once, and 33 in the time of 64. 1: the paper's number, rounded down.
+    """
+
+    unit: str = "pixel"
+    multiple: int = 1
+
+    def __post_init__(self) -> None:
+        require(self.unit in SAMPLE_UNITS, "unit", self.unit, f"one of {', '.join(SAMPLE_UNITS)}")
+        divides = self.multiple >= 1 and TILE_PIXELS % self.multiple == 0
+        require(divides, "multiple", self.multiple, f"a divisor of {TILE_PIXELS}, the pixels of a tile")
+
+    @property
+    def rule(self) -> DrawRule:
+        """One stage, which ignores the maps."""
+        return DrawRule(self.unit, 0.0, 0.0, mixed_uniform=True, importance=0.0, multiple=self.multiple)
 
 
 @dataclass
-class ErrorGuidedPixelSampler(RulePixelSampler):
+class ErrorGuidedPixelSampler(RandomPixelSampler):
     """The paper's sampler: hard units by error, stable ones by age, the rest by both (`engine.reference.draws`).
 
     Args:
@@ -83,56 +103,28 @@ class ErrorGuidedPixelSampler(RulePixelSampler):
         stable_ratio: r_stable, share of the units of each tile drawn by age; 0.3 in the paper.
         mixed: draw of the remaining share, which the paper names but does not define: by `error_age`, the mean of the
             two normalised distributions, or `uniform`.
-        unit: `pixel`, as in the paper, or `tile`: whole tiles of a view, which begin elsewhere in each iteration
-            (`DrawRule.origin`).
         importance: exponent a of the importance weights p^-a, p the probability that a unit is drawn: 0 none, as in the
             paper's runs; 1 unbiased (exactly so for a draw of a single stage).
-        multiple: samples of a tile are rounded to a multiple of this, where `unit` is `pixel`. The rasterizer takes 32
-            samples at once, and 33 in the time of 64. 1: the paper's number, rounded down.
     """
 
     hard_ratio: float = 0.4
     stable_ratio: float = 0.3
     mixed: str = "error_age"
-    unit: str = "pixel"
     importance: float = 0.0
-    multiple: int = 1
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require(0 <= self.hard_ratio <= 1, "hard_ratio", self.hard_ratio, "between 0 and 1")
         allowed = f"between 0 and 1 - hard_ratio ({1 - self.hard_ratio:g})"
         require(0 <= self.stable_ratio <= 1 - self.hard_ratio + 1e-9, "stable_ratio", self.stable_ratio, allowed)
         require(self.mixed in ("error_age", "uniform"), "mixed", self.mixed, "error_age or uniform")
-        require(self.unit in SAMPLE_UNITS, "unit", self.unit, f"one of {', '.join(SAMPLE_UNITS)}")
         require(0 <= self.importance <= 1, "importance", self.importance, "between 0 and 1")
-        _require_divisor(self.multiple)
 
     @property
     def rule(self) -> DrawRule:
+        """Three stages: by error, by age, and the rest."""
         stages = (self.hard_ratio, self.stable_ratio, self.mixed == "uniform")
         return DrawRule(self.unit, *stages, self.importance, self.multiple)
-
-
-@dataclass
-class RandomPixelSampler(RulePixelSampler):
-    """Uniformly random pixels of each tile (or tiles of each view), without replacement.
-
-    Args:
-        unit: `pixel`, or `tile`: whole tiles of a view.
-        multiple: samples of a tile are rounded to a multiple of this (`ErrorGuidedPixelSampler`).
-    """
-
-    unit: str = "pixel"
-    multiple: int = 1
-
-    def __post_init__(self) -> None:
-        require(self.unit in SAMPLE_UNITS, "unit", self.unit, f"one of {', '.join(SAMPLE_UNITS)}")
-        _require_divisor(self.multiple)
-
-    @property
-    def rule(self) -> DrawRule:
-        """One stage, which ignores the maps."""
-        return DrawRule(self.unit, 0.0, 0.0, mixed_uniform=True, importance=0.0, multiple=self.multiple)
 
 
 @dataclass

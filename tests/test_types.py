@@ -104,9 +104,9 @@ ONE = torch.tensor([1])
         ((ONE, torch.tensor([16]), ONE, SIZES), r"outside its image \(view 1, x 16, y 1\)"),
         ((ONE, ONE, -ONE, SIZES), r"outside its image \(view 1, x 1, y -1\)"),
         ((ONE.repeat(2), ONE.repeat(2), ONE.repeat(2), SIZES), r"twice \(view 1, x 1, y 1\)"),
-        ((ONE, ONE.float(), ONE, SIZES), "x is torch.float32: expected a tensor of integers"),
-        ((ONE, ONE, [1], SIZES), "y is list: expected a tensor of integers"),
-        ((ONE.repeat(2), ONE, ONE, SIZES), r"views has shape \(2,\)"),
+        ((ONE, ONE.float(), ONE, SIZES), "x is not a tensor of integers"),
+        ((ONE, ONE, [1], SIZES), "y is not a tensor of integers"),
+        ((ONE.repeat(2), ONE, ONE, SIZES), r"views is not .* \[P\] as x and y"),
         ((ONE[:0], ONE[:0], ONE[:0], SIZES), "P at least 1"),
         ((ONE, ONE, ONE, (37, 21)), r"sizes have shape \(2,\)"),
         ((ONE, ONE, ONE, SIZES, (4, 4)), "expected 2 different numbers of views"),
@@ -118,16 +118,12 @@ def test_pixels_that_do_not_fit_are_refused(arguments, words):
 
 
 @pytest.mark.parametrize(
-    ("mask", "words"),
-    [
-        (torch.ones(4, 4), r"mask is torch.float32 \(4, 4\): expected a tensor of bool"),
-        (torch.ones(4, dtype=torch.bool), r"mask is torch.bool \(4,\)"),
-        (np.ones((4, 4), bool), "mask is ndarray"),
-        (torch.zeros(4, 4, dtype=torch.bool), "P at least 1"),
-    ],
+    "mask",
+    [torch.ones(4, 4), torch.ones(4, dtype=torch.bool), np.ones((4, 4), bool), torch.zeros(4, 4).bool()],
+    ids=str,
 )
-def test_a_mask_that_does_not_fit_is_refused(mask, words):
-    with pytest.raises(InputError, match=words):
+def test_a_mask_that_does_not_fit_is_refused(mask):
+    with pytest.raises(InputError, match=r"a tensor of bool|P at least 1"):
         PixelSamples.from_mask(mask)
 
 

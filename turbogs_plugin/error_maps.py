@@ -102,16 +102,8 @@ class ErrorMaps:
         Raises:
             InputError: there is no image, one is not a tensor [H, W], or a mask has another shape.
         """
-        if len(errors) == 0:
-            raise InputError("error images: there are none, give one [H, W] for each view")
-        for view_id, image in enumerate(errors):
-            if not isinstance(image, Tensor):
-                raise InputError(
-                    f"error image of view {view_id} is a {type(image).__name__}, expected a tensor [H, W]: "
-                    "torch.from_numpy makes one of a numpy array"
-                )
-            if image.dim() != 2:
-                raise InputError(f"error image of view {view_id} has shape {tuple(image.shape)}, expected [H, W]")
+        if len(errors) == 0 or any(not isinstance(image, Tensor) or image.dim() != 2 for image in errors):
+            raise InputError("error images: give a tensor [H, W] for each view; torch.from_numpy makes one of an array")
         sizes = np.array([(image.shape[1], image.shape[0]) for image in errors], dtype=np.int64)
         of_pixels = None if masks is None else PixelMasks.from_images(masks)
         maps = cls(sizes, device=errors[0].device, masks=of_pixels, **options)

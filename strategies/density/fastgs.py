@@ -10,7 +10,7 @@ from torch import Tensor
 
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
-from turbogs_plugin.strategies.density.rows import add_stats, finite_rows, leave_one, loaded_rows, removal, saved_rows
+from turbogs_plugin.strategies.density.rows import add_stats, finite_rows, keep_one, loaded_rows, removal, saved_rows
 from turbogs_plugin.strategies.protocols import DensityController
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
@@ -178,4 +178,4 @@ class FastGsDensity(DensityController):
         blamed = blame > BLAME_THRESHOLD * blame.max()
         blamed &= ~blamed.all()  # all alike: nothing distinguishes them
         transparent = torch.sigmoid(gaussians.opacities) < self._events.prune_opacity
-        return removal(leave_one(blamed | transparent | ~finite_rows(gaussians), gaussians))
+        return removal(~keep_one(finite_rows(gaussians) & ~(blamed | transparent), gaussians)[0])

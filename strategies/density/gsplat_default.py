@@ -12,7 +12,7 @@ from gsplat.strategy.ops import reset_opa
 from torch import Tensor
 
 from turbogs_plugin.strategies.checks import require_at_least_one, require_settings
-from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, leave_one, removal
+from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, keep_one, removal
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 
@@ -67,7 +67,7 @@ class GsplatDefaultDensity(WindowedDensity):
             return None
         usable = torch.nonzero(finite_rows(gaussians)).squeeze(-1)
         if len(usable) == 0:
-            return self._keep_one(gaussians)
+            return self._only_one(gaussians)
         strategy = _FilledStrategy(
             refine_start_iter=self.refine_start_iter, refine_every=self.refine_every, refine_stop_iter=step.refine_until
         )
@@ -84,13 +84,13 @@ class GsplatDefaultDensity(WindowedDensity):
         if reset_due and self.opacity_reset == "repaired":
             reset_opa(params, optimizers, state, strategy.prune_opa * 2.0)
         if len(state["source_row"]) == 0:
-            return self._keep_one(gaussians)
+            return self._only_one(gaussians)
         return self._change(gaussians, params, optimizers, state)
 
-    def _keep_one(self, gaussians: Gaussians) -> RowUpdate | None:
-        """Keep only the most opaque finite Gaussian, so that the model is never empty."""
+    def _only_one(self, gaussians: Gaussians) -> RowUpdate | None:
+        """The removal of all but the most opaque finite Gaussian, so that the model is never empty."""
         self.window.zero_()
-        return removal(leave_one(torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians))
+        return removal(~keep_one(torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device), gaussians)[0])
 
     def _change(self, gaussians: Gaussians, params: dict, optimizers: dict, state: dict) -> RowUpdate | None:
         """The change that gsplat has made, as a `RowUpdate`."""

@@ -122,11 +122,6 @@ def keep_one(kept: Tensor, gaussians: Gaussians) -> tuple[Tensor, int]:
     return kept, 1
 
 
-def leave_one(pruned: Tensor, gaussians: Gaussians) -> Tensor:
-    """The mask [N]. If it would prune every Gaussian, the most opaque (finite) one is taken out of it."""
-    return ~keep_one(~pruned, gaussians)[0]
-
-
 def removal(pruned: Tensor) -> RowUpdate | None:
     """The change that removes the Gaussians of the mask [N]; None if there are none."""
     source = torch.nonzero(~pruned).squeeze(-1)

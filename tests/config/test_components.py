@@ -115,12 +115,10 @@ def test_a_module_that_breaks_as_it_is_imported_is_named(source, reason):
 
 REFUSED = [
     ("loss", {"type": "charbonier"}, "did you mean 'charbonnier'"),
-    ("loss", {"type": 5}, "unknown loss.type '5'"),
     ("losses", {}, "did you mean 'loss'"),
     ("schedule", {"type": "fixed", "view": 1}, "did you mean 'views'"),
     ("schedule", ["fixed"], "expected a mapping"),
     ("pixel_sampler", {"type": "no_such_module:X"}, "'no_such_module:X'.*cannot be imported: ModuleNotFoundError"),
-    ("pixel_sampler", {"type": "third_party:"}, "cannot be imported"),
     ("pixel_sampler", {"type": "os:sep"}, "'os:sep' .*is not a dataclass"),
     *(("pixel_sampler", {"type": f"third_party:{x}"}, "not a dataclass") for x in ("function", "instance", "Plain")),
     ("pixel_sampler", {"type": "third_party:MySampler", "shar": 1}, "did you mean 'share'"),

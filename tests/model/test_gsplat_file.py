@@ -30,14 +30,6 @@ def test_what_is_written_is_what_gsplat_loads(tmp_path, sh_degree):
         torch.testing.assert_close(read, value, msg=name)
 
 
-def test_rows_that_are_not_finite_are_not_written(tmp_path):
-    gaussians = random_gaussians()
-    gaussians.means[3, 0] = torch.nan
-    with pytest.warns(UserWarning, match="1 of 40 Gaussians are not finite"):
-        save_gsplat(gaussians, tmp_path / "model.pt", Frame(np.zeros(3), 1.0))
-    assert len(torch.load(tmp_path / "model.pt", weights_only=True)["splats"]["means"]) == 39
-
-
 def test_what_cannot_be_written_is_refused(tmp_path):
     frame = Frame(np.zeros(3), 1.0)
     with pytest.raises(InputError, match="no Gaussians"):
@@ -71,5 +63,5 @@ def test_splats_that_are_no_model(changes, words):
 def test_no_splats_at_all():
     with pytest.raises(InputError, match="holds no Gaussians"):
         read_gsplat({"splats": dict(random_gaussians(0).items())}, "model.pt")
-    with pytest.raises(InputError, match="not a table"):
+    with pytest.raises(InputError, match="lack means"):
         read_gsplat({"splats": [1]}, "model.pt")

@@ -4,9 +4,10 @@ import math
 
 import pytest
 import torch
+from helpers.models import random_gaussians
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.initial import BACKDROP_RADIUS, backdrop_gaussians, gaussians_from_points
+from turbogs_plugin.model.initial import BACKDROP_RADIUS, backdrop_gaussians, gaussians_from_points, with_degree
 from turbogs_plugin.types import SH_C0
 
 
@@ -79,3 +80,11 @@ def test_a_backdrop_surrounds_everything_in_its_colour():
     # Whatever the direction, the nearest Gaussian's centre is within one standard deviation.
     nearest = torch.cdist(directions * BACKDROP_RADIUS * 3.0, backdrop.means).amin(dim=1)
     assert (nearest < backdrop.scales.exp().amin()).all()
+
+
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_bands_are_dropped_or_added_as_zeros(degree):
+    gaussians = random_gaussians(sh_degree=2)
+    bands, kept = (degree + 1) ** 2 - 1, min(8, (degree + 1) ** 2 - 1)
+    made = with_degree(gaussians, degree).shN
+    assert made.shape[1] == bands and torch.equal(made[:, :kept], gaussians.shN[:, :kept]) and not made[:, kept:].any()

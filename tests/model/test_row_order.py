@@ -32,15 +32,6 @@ def test_order_is_that_of_the_keys():
     assert spatial_order(means, 2.0).tolist() == sorted(range(300), key=lambda row: (keys[row], row))
 
 
-def test_neighbours_in_space_are_neighbours_in_memory():
-    means = torch.rand(4000, 3, generator=torch.Generator().manual_seed(1))
-
-    def step(points):
-        return (points[1:] - points[:-1]).norm(dim=1).mean()
-
-    assert step(means[spatial_order(means, 1.0)]) < 0.15 * step(means)
-
-
 def test_far_and_none():
     assert spatial_order(torch.zeros(0, 3), 1.0).tolist() == []
     far = torch.tensor([[3e38, -3e38, 0.0], [-3e38, 3e38, 0.0], [math.inf, 0.0, 0.0]])

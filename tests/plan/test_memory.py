@@ -9,7 +9,7 @@ import pytest
 from turbogs_plugin.config.configuration import load_config, resolve
 from turbogs_plugin.config.sections import parse_bytes
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, cap_of, growth_room, lowered_cap, with_cap, without_growth
+from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, cap_of, chosen_points, growth_room, with_cap, without_growth
 from turbogs_plugin.plan.memory import MemoryDemand, most_images
 
 
@@ -20,16 +20,13 @@ def test_a_cap_is_a_setting_of_the_density_control(kind):
     assert capped.density["max_gaussians"] == cap_of(capped) == capped.build("density").max_gaussians == 5000
     assert resolve(capped.to_mapping()) == capped
     assert with_cap(capped, 7000).density["max_gaussians"] == 7000, "what is asked for last is set"
-    assert lowered_cap(capped, 7000) == capped
-    assert lowered_cap(capped, 700).density["max_gaussians"] == 700
     still = without_growth(capped)
     assert (still.density, cap_of(still)) == ({"type": "none", "max_gaussians": 5000}, 5000)
 
 
-def test_no_cap_is_lowered_to_any():
+def test_no_cap_is_0():
     free = load_config("turbogs")
     assert cap_of(free) == cap_of(without_growth(free)) == 0
-    assert lowered_cap(free, 700).density["max_gaussians"] == 700
 
 
 @pytest.mark.parametrize(
@@ -56,10 +53,19 @@ def test_a_cap_that_nobody_would_keep_is_refused(turbogs, tmp_path, kind):
     assert cap_of(config) == 0
     words = f"density.type {kind} keeps no cap on Gaussians: use one of error_driven, mcmc, none"
     with pytest.raises(InputError, match=words):
-        lowered_cap(config, 10)
+        with_cap(config, 10)
     options = [f"density.type={kind}", "--out", tmp_path / "run", "--max-gaussians", 10]
     code, _, err = turbogs("train", tmp_path, *options)
     assert code == 2 and words in err
+
+
+def test_a_model_begins_with_points_from_the_first_to_the_last_that_leave_room():
+    chosen = chosen_points(100, 30, 10)
+    assert len(chosen) == 20 and (chosen[0], chosen[-1]) == (0, 99)
+    assert set(np.diff(chosen)) == {5, 6}
+    assert chosen_points(20, 30, 10) == chosen_points(20, 0, 10) == slice(None)
+    with pytest.raises(InputError, match="leaves no room beside the 30"):
+        chosen_points(20, 30, 30)
 
 
 def demand(*overrides: str) -> MemoryDemand:

@@ -25,11 +25,7 @@ pytestmark = pytest.mark.usefixtures("plotted")
 
 MIB = 2**20
 FACTS = SceneFacts(
-    scene="synthetic",
     train_views=100,
-    test_views=10,
-    largest_photo=(900, 600),
-    points=10_000,
     exposure_spread=0.05,
     exposure_rest=0.05,
     exposure_views=100,
@@ -57,33 +53,14 @@ ONE_VIEW = ("schedule.type=fixed", "schedule.views=1")
 BOTH_SIDES = [
     ("train.backdrop", {"direction_concentration": 0.95}, (), True, "0.950 >= 0.95"),
     ("train.backdrop", {"direction_concentration": 0.9499}, (), False, "< 0.95"),
-    (
-        "train.backdrop",
-        {"direction_concentration": 0.95},
-        ("density.max_gaussians=3000",),
-        False,
-        "3000 Gaussians leave no room within density.max_gaussians 3000",
-    ),
+    ("train.backdrop", {"direction_concentration": 0.95}, ("density.max_gaussians=3000",), False, "leave no room"),
     ("train.backdrop", {"direction_concentration": 0.95}, ("density.max_gaussians=3001",), True, "0.950 >= 0.95"),
     ("train.background", {"transparent": False}, (), "black", "opaque"),
     ("train.background", {"transparent": True}, (), "random", "transparent"),
-    (
-        "train.exposure",
-        {"exposure_spread": 0.1, "exposure_rest": 0.05},
-        (),
-        True,
-        "photos 0.10 stops apart >= 0.05, and 0.05 from those before and after <= 0.5 of that",
-    ),
+    ("train.exposure", {"exposure_spread": 0.1, "exposure_rest": 0.05}, (), True, "before and after <= 0.5 of that"),
     ("train.exposure", {"exposure_spread": 0.1, "exposure_rest": 0.06}, (), False, "before and after > 0.5 of that"),
     ("train.exposure", {"exposure_spread": 0.04, "exposure_rest": 0.0}, (), False, "0.04 stops apart < 0.05"),
-    (
-        "train.exposure",
-        {"exposure_spread": 1.0, "exposure_views": 9},
-        (),
-        False,
-        "only 9 of 100 photos could be compared",
-    ),
-    ("train.exposure", {"exposure_spread": 1.0, "exposure_views": 49}, (), False, "only 49 of 100 photos"),
+    ("train.exposure", {"exposure_spread": 1.0, "exposure_views": 49}, (), False, "only 49 of 100 photos could be"),
     ("train.exposure", {"exposure_spread": 1.0, "exposure_views": 50}, (), True, "1.00 stops apart >= 0.05"),
     ("train.exposure", {"exposure_spread": 1.0, "transparent": True}, (), False, "transparent"),
     ("train.dropout", {"reprojection_error": 0.4}, (), 0.2, "points 0.40 pixels from where photos show them >= 0.4"),
@@ -93,31 +70,22 @@ BOTH_SIDES = [
     ("train.batch_for", {"processes": 2}, (), 2, "2 processes"),
     ("train.batch_for", {"processes": 4}, (), 2, "4 processes, of which a batch for 2 costs no error"),
     ("train.batch_for", {"processes": 2, "train_views": 19}, (), 1, "2 processes, but 2 times 10 views > 19 training"),
-    ("train.batch_for", {"processes": 4, "train_views": 9}, (), 1, "no error, but 2 times 10 views > 9 training views"),
     ("train.batch_for", {"processes": 2, "train_views": 500}, ("schedule.max_views=65",), 1, "> an iteration's 128"),
     ("train.batch_for", {"processes": 2}, ("schedule.type=fixed", "schedule.views=60"), 1, "2 times 60 views > 100"),
-    ("train.iterations", {"train_views": 100, "processes": 2}, ("train.batch_for=1",), 6000, "60 epochs"),
     ("train.iterations", {"train_views": 100, "processes": 2}, ("train.batch_for=2",), 6000, "60 epochs"),
     ("train.iterations", {"train_views": 100, "processes": 2}, ("train.batch_for=auto",), 3000, "2 times the pixels"),
     ("train.iterations", {"train_views": 100}, ("train.epochs=75",), 7500, "75 epochs of 100 training views"),
-    ("train.iterations", {"train_views": 43}, ("train.epochs=75",), 3300, "75 epochs of 43 training views"),
     ("train.iterations", {"train_views": 100}, ("train.epochs=75", "schedule.pixel_budget=0.5"), 15000, "75 epochs"),
     ("train.iterations", {"train_views": 600}, ("train.epochs=75", "pixel_sampler.type=dense"), 4500, "75 epochs"),
     ("train.iterations", {"train_views": 100}, (*ONE_VIEW, "schedule.pixel_budget=4"), 6000, "60 epochs"),
-    ("train.iterations", {"train_views": 499}, (), 30000, "60 epochs of 499 training views: 0.6 to 2.0 min on an H200"),
-    ("train.iterations", {"train_views": 500}, (), 30000, "views: 0.7 to 2.0 min on an H200; --time-budget for less"),
     ("train.iterations", {"train_views": 501}, (), 30000, "501 training views take 30060; at most 30000, where a"),
     ("train.iterations", {"train_views": 2625}, (), 30000, "take 157500; at most 30000, where a pixel is sampled 11.4"),
-    ("train.iterations", {"train_views": 2625}, (), 30000, ": 0.7 to 2.0 min on an H200; --time-budget for less or"),
-    ("train.iterations", {"train_views": 500, "device": "cpu"}, (), 30000, "for less; hours or days on this CPU"),
     ("train.iterations", {"train_views": 2625, "processes": 2}, ("train.batch_for=auto",), 15000, "sampled 11.4 times"),
     ("train.iterations", {"train_views": 20}, ("train.epochs=75",), 2000, "take fewer than 2000, the least"),
     ("train.iterations", {"train_views": 43, "processes": 2}, ("train.batch_for=auto",), 1500, "fewer than 1414, the"),
-    ("train.iterations", {"train_views": 43, "processes": 4}, ("train.batch_for=auto",), 1500, "fewer than 1414, the"),
     ("train.maps_place", {"device_free_bytes": 240 * MIB}, (), "device", "120 MiB <= 50% of 240 MiB free"),
     ("train.maps_place", {"device_free_bytes": 239 * MIB}, (), "host", "120 MiB > 50% of 239 MiB free"),
     ("train.maps_place", {"device_free_bytes": 240 * MIB}, ("train.photos_place=device",), "host", "beside 100 MiB"),
-    ("train.maps_place", {"memory_limit": 239 * MIB}, (), "host", "239 MiB allowed"),
     (
         "train.maps_place",
         {"device_free_bytes": 239 * MIB, "memory_limit": 240 * MIB},
@@ -129,7 +97,6 @@ BOTH_SIDES = [
     ("train.photos_place", {"device_free_bytes": 440 * MIB}, (), "device", "beside 120 MiB of maps <= 50% of 440 MiB"),
     ("train.photos_place", {"device_free_bytes": 439 * MIB}, (), "host", "> 50% of 439 MiB free"),
     ("train.photos_place", {"device_free_bytes": 200 * MIB}, (), "device", "100 MiB <= 50% of 200 MiB free"),
-    ("train.photos_place", {"device_free_bytes": 439 * MIB}, ("train.maps_place=host",), "device", "100 MiB <= 50%"),
 ]
 
 
@@ -147,17 +114,12 @@ def test_every_setting_that_may_be_auto_has_both_sides_above():
 
 
 SET = [
-    ("train.backdrop", "true", {}, lambda config: config.train.backdrop is True),
     ("train.backdrop", "false", {"direction_concentration": 1.0}, lambda config: config.train.backdrop is False),
     ("train.background", "white", {}, lambda config: config.train.background == "white"),
-    ("train.background", "black", {"transparent": True}, lambda config: config.train.background == "black"),
     ("train.exposure", "true", {}, lambda config: config.train.exposure is True),
-    ("train.exposure", "false", {"exposure_spread": 1.0}, lambda config: config.train.exposure is False),
     ("train.batch_for", "2", {"processes": 2}, lambda config: config.schedule["pixel_budget"] == 1.0),
     ("train.iterations", "700", {"train_views": 250}, lambda config: config.train.refine_until == 3500),
     ("train.maps_place", "host", {}, lambda config: config.train.maps_place == "host"),
-    ("train.maps_place", "device", {"device_free_bytes": MIB}, lambda config: config.train.maps_place == "device"),
-    ("train.photos_place", "host", {}, lambda config: config.train.photos_place == "host"),
     ("train.photos_place", "device", {"device_free_bytes": MIB}, lambda config: config.train.photos_place == "device"),
 ]
 
@@ -169,13 +131,6 @@ def test_what_is_set_wins_and_the_plan_says_so(setting, value, changes, holds):
     line = next(line for line in plan.text().splitlines() if line.startswith(f"  {setting} "))
     assert line.split()[1:4] == [value, "set", "auto:"]
     assert holds(plan.apply(config))
-
-
-def test_the_layer_above_wins_over_auto_and_auto_over_what_is_below(tmp_path):
-    upper = tmp_path / "upper.yaml"
-    upper.write_text("base: turbogs\ntrain: {exposure: auto, batch_for: auto, backdrop: true}\n")
-    config = load_config(str(upper), ["train.batch_for=2"])
-    assert (config.train.batch_for, config.train.backdrop, config.train.exposure) == (2, True, "auto")
 
 
 @pytest.mark.parametrize("name", ["turbogs", "mcmc", "3dgs"])
@@ -255,13 +210,7 @@ def test_the_verb_prints_the_plan_of_a_capture(turbogs, capture):
         "train.maps_place": ["device", "auto"],
         "train.photos_place": ["device", "auto"],
     }
-    for fact in ("7 + 1 views of at most 48x40 pixels", "MiB free on the CPU"):
-        assert fact in " ".join(out.split())
-    grown = ("schedule.max_views=2", "schedule.min_views=1", "train.batch_for=auto", "--device", "cpu", "--gpus", 4)
-    code, out, err = turbogs("plan", capture, *grown)
-    assert code == 0 and re.search(r"train.batch_for +2 +auto +4 processes, of which a batch for 2", out)
-    assert ", 4 processes" in " ".join(out.split())
-    assert turbogs("plan", capture, "--gpus", 0)[0] == 2
+    assert "plan for 7 training views" in out
     code, out, err = turbogs("plan", capture.parent / "absent")
     assert code == 2 and "no such scene" in err
 

@@ -98,7 +98,7 @@ STAGED = [
 @pytest.mark.parametrize(("hard", "stable", "mixed", "stages"), STAGED)
 def test_pixel_frequencies_are_exact(hard, stable, mixed, stages):
     """1,500 views of 3x2 pixels, 3 drawn of each."""
-    sampler = ErrorGuidedPixelSampler(hard, stable, mixed)
+    sampler = ErrorGuidedPixelSampler(hard_ratio=hard, stable_ratio=stable, mixed=mixed)
     drawn = drawn_units(sampler, 3.5 / 256, 1500, (3, 2), ERRORS, AGES, torch.arange(6))
     assert (drawn.sum(axis=1) == 3).all()
     assert_frequencies(drawn, exact_sets(ERRORS, AGES, stages, mixed == "uniform"))
@@ -109,7 +109,7 @@ def test_tiles_are_drawn_by_their_sums(hard, stable, mixed, stages):
     """Six tiles of a view, of equal pixels."""
     y, x = np.mgrid[0:32, 0:48]
     units = torch.as_tensor((y // 16 * 3 + x // 16).reshape(-1))
-    sampler = ErrorGuidedPixelSampler(hard, stable, mixed, unit="tile")
+    sampler = ErrorGuidedPixelSampler(hard_ratio=hard, stable_ratio=stable, mixed=mixed, unit="tile")
     drawn = drawn_units(sampler, 3 / 6, 600, (48, 32), ERRORS, AGES, units)
     assert (drawn.sum(axis=1) == 3).all()
     assert_frequencies(drawn, exact_sets(ERRORS, AGES, stages, mixed == "uniform"))
@@ -122,7 +122,7 @@ def test_a_tile_with_one_bad_pixel_counts_its_sum_and_its_oldest():
     maps.initialise(0, errors)
     stamps[60 * 64 + 60] = -2  # the last tile
     maps.stamps.copy_(stamps)
-    samples = ErrorGuidedPixelSampler(0.5, 0.5, unit="tile").sample(maps, (0,), 2 / 16, step(0))
+    samples = ErrorGuidedPixelSampler(hard_ratio=0.5, stable_ratio=0.5, unit="tile").sample(maps, (0,), 2 / 16, step(0))
     assert samples.tile_ids.tolist() == [2, 15]
 
 

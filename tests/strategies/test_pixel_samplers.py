@@ -243,7 +243,7 @@ def test_one_hot_tile_always_gives_the_hot_pixel_and_else_is_uniform():
 def test_smallest_error_comes_before_zero_errors():
     errors = torch.zeros(256)
     errors[100:110] = 6e-8
-    counts, _ = many_tiles(errors, sampler=ErrorGuidedPixelSampler(1.0, 0.0))
+    counts, _ = many_tiles(errors, sampler=ErrorGuidedPixelSampler(hard_ratio=1.0, stable_ratio=0.0))
     assert (counts[100:110] == 400).all()
 
 
@@ -257,7 +257,7 @@ def test_one_pixel_a_tile():
 
 def test_ages_past_sixteen_bits_still_rank():
     maps = ErrorMaps.from_images(torch.rand(1, 16, 16))
-    sampler, visited = ErrorGuidedPixelSampler(0.0, 1.0), 60_000
+    sampler, visited = ErrorGuidedPixelSampler(hard_ratio=0.0, stable_ratio=1.0), 60_000
     first = sampler.sample(maps, (0,), 0.5, step(visited))
     maps.update(first, torch.rand(len(first)), step(visited))
     second = sampler.sample(maps, (0,), 0.5, step(visited + 32_766))  # one iteration before the visited saturate

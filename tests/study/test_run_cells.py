@@ -17,7 +17,7 @@ from turbogs_plugin import cli
 from turbogs_plugin.captures.demo import write_demo_capture
 from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.plan.decisions import RULES, Verdict
+from turbogs_plugin.plan.decisions import RULES
 from turbogs_plugin.report.provenance import provenance
 from turbogs_plugin.study import cell as cell_module
 from turbogs_plugin.study import run_cells
@@ -263,7 +263,7 @@ def test_the_digest_of_a_capture_is_of_names_and_sizes(capture):
 
 def test_a_cell_has_the_planned_length_and_keeps_a_cap_on_gaussians(tmp_path, monkeypatch):
     scene = load_scene(tiny_capture(tmp_path))
-    monkeypatch.setitem(RULES, "train.iterations", lambda facts, config: Verdict(6, "few"))
+    monkeypatch.setitem(RULES, "train.iterations", lambda facts, config: (6, "few"))
     capped = ["train.iterations=auto", "density.max_gaussians=90"]
     result = train_cell("x", load_config("turbogs", [*TINY, *capped]), scene, torch.device("cpu"), provenance("cpu"))
     assert result.final["iteration"] == 6 == result.planned["train.iterations"]

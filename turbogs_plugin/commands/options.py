@@ -66,7 +66,7 @@ class RunOptions:
         more = [f"{name}={json.dumps(value)}" for name, value in given.items() if value is not None]
         asked = DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *more)
         settings = load_config(*asked)
-        require_one_length(*asked)
+        require_one_length(asked[1])
         if self.max_gaussians is not None:
             settings = with_cap(settings, self.max_gaussians)
         if scene is not None:

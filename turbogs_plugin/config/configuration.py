@@ -117,21 +117,15 @@ def load_config(name_or_file: str = DEFAULT_CONFIG, overrides: Sequence[str] = (
     return resolve(apply_overrides(_load_mapping(name_or_file), overrides))
 
 
-def require_one_length(name_or_file: str, overrides: Sequence[str]) -> None:
-    """Raise `InputError` where overrides ask for a time budget and a number of iterations, or for one of them beside a
-    file of the user's that has the other.
-
-    A number in a packaged configuration is no request. A file that has both is no contradiction either: a run with a
-    time budget writes both into its configuration.
+def require_one_length(overrides: Sequence[str]) -> None:
+    """Raise `InputError` where overrides ask for a time budget and a number of iterations.
 
     Args:
-        name_or_file, overrides: the arguments of `load_config`.
+        overrides: as for `load_config`. A number in a YAML is the length of a run without a time budget.
     """
-    told = apply_overrides({}, overrides)
-    asked = _merge(_load_mapping(name_or_file, packaged=False), told)
+    asked = apply_overrides({}, overrides)
     iterations, seconds = asked.get("train", {}).get("iterations"), asked.get("budget", {}).get("time")
-    by_override = "iterations" in told.get("train", {}) or "time" in told.get("budget", {})
-    if by_override and seconds and iterations not in (None, AUTO):
+    if seconds and iterations not in (None, AUTO):
         raise InputError(
             f"train.iterations={iterations} and the time budget {seconds} exclude each other: leave one out, or "
             f"write train.iterations={AUTO}"
@@ -199,17 +193,13 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
     return result
 
 
-def _load_mapping(name_or_file: str, depth: int = 0, packaged: bool = True) -> dict[str, Any]:
-    """The mapping of a configuration on top of its bases, or without what comes from packaged ones."""
-    if not packaged and name_or_file in config_names():
-        return {}
+def _load_mapping(name_or_file: str, depth: int = 0) -> dict[str, Any]:
+    """The mapping of a configuration on top of its bases."""
     if depth > BASE_DEPTH_LIMIT:
         raise InputError(f"config '{name_or_file}': its bases form a circle")
     mapping = read_named_yaml(name_or_file, PACKAGE, "config")
     base = mapping.pop("base", None)
-    if base is None:
-        return mapping
-    return _merge(_load_mapping(named_beside(str(base), name_or_file), depth + 1, packaged), mapping)
+    return _merge(_load_mapping(named_beside(str(base), name_or_file), depth + 1), mapping) if base else mapping
 
 
 def named_beside(name: str, file: str) -> str:
@@ -224,15 +214,10 @@ def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     result = dict(under)
     for key, value in over.items():
         below = result.get(key)
-        if isinstance(below, Mapping) and isinstance(value, Mapping):
-            result[key] = dict(value) if _changes_type(key, below, value) else _merge(below, value)
-        else:
+        if not (isinstance(below, Mapping) and isinstance(value, Mapping)):
             result[key] = value
+        elif key in KINDS and "type" in value and value["type"] != below.get("type", default_type(key)):
+            result[key] = dict(value)
+        else:
+            result[key] = _merge(below, value)
     return result
-
-
-def _changes_type(kind: str, below: Mapping[str, Any], value: Mapping[str, Any]) -> bool:
-    if kind not in KINDS or "type" not in value:
-        return False
-    default = default_type(kind)
-    return value["type"] != below.get("type", default)

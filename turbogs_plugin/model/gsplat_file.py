@@ -47,17 +47,13 @@ def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:
     Raises:
         InputError: parameters that are missing, of other shapes, or none at all.
     """
-    splats = state["splats"]
-    if not isinstance(splats, Mapping):
-        raise InputError(f"{path}: its 'splats' are not a table of tensors: export the model again, or as a .ply")
-    if "features" in splats and "sh0" not in splats:
-        raise InputError(
-            f"{path} has the colours of gsplat's appearance network (app_opt), not spherical harmonics: export it "
-            "there as a .ply, or train it without app_opt"
-        )
+    splats = state["splats"] if isinstance(state["splats"], Mapping) else {}
     if missing := [name for name in PARAMETER_NAMES if not isinstance(splats.get(name), Tensor)]:
         present = ", ".join(sorted(map(str, splats))[:8]) or "nothing"
-        raise InputError(f"{path}: its splats lack {', '.join(missing)} (there is {present}): give a 3DGS model")
+        raise InputError(
+            f"{path}: its splats lack {', '.join(missing)} (there is {present}): give a 3DGS model, trained without "
+            "gsplat's appearance network (app_opt)"
+        )
     count = len(splats["means"]) if splats["means"].dim() else 0
     bands = splats["shN"].shape[1] if splats["shN"].dim() == 3 else -1
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 1, 3), (count, bands, 3))

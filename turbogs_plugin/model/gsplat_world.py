@@ -65,14 +65,15 @@ def gsplat_worlds(viewmats: np.ndarray, points: np.ndarray) -> list[Similarity]:
     Returns:
         Empty where the cameras or points do not determine a world.
     """
+    from scipy.spatial.transform import Rotation
+
     if len(points) < 4:
         return []
     centers, axes = camera_centers(viewmats), viewmats[:, :3, :3]  # rows of a rotation: right, down, forward
     up = -axes[:, 1].mean(axis=0)
-    length = np.linalg.norm(up)
-    if length < 1e-9:
+    if np.linalg.norm(up) < 1e-9:
         return []
-    upright = _smallest_rotation(up / length, np.array([0.0, -1.0, 0.0]))
+    upright = Rotation.align_vectors([[0.0, -1.0, 0.0]], [up])[0].as_matrix()  # by the smallest angle
     centers, forward = centers @ upright.T, axes[:, 2] @ upright.T
     nearest = centers - (centers * forward).sum(axis=1, keepdims=True) * forward
     focus = np.median(nearest, axis=0)
@@ -88,13 +89,3 @@ def gsplat_worlds(viewmats: np.ndarray, points: np.ndarray) -> list[Similarity]:
     second = Similarity(rotation, 1.0, -rotation @ np.median(turned, axis=0))
     world = second.after(first)
     return [Similarity(np.diag(signs), 1.0, np.zeros(3)).after(world) for signs in HALF_TURNS]
-
-
-def _smallest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """[3, 3] the rotation by the smallest angle that brings one unit vector to another (Rodrigues)."""
-    cosine = float(start @ end)
-    if cosine < -1.0 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])  # half a turn, as `end` is along the y axis
-    x, y, z = np.cross(start, end)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + cross + cross @ cross / (1.0 + cosine)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -94,3 +95,10 @@ def backdrop_gaussians(color: Tensor, sh_degree: int, extent: float) -> Gaussian
     backdrop = gaussians_from_points(directions * BACKDROP_RADIUS * extent, colors, sh_degree, extent)
     backdrop.opacities.fill_(math.log(BACKDROP_OPACITY / (1.0 - BACKDROP_OPACITY)))
     return backdrop
+
+
+def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:
+    """The model with room for exactly this degree: higher bands are dropped, missing ones are zero."""
+    bands = (degree + 1) ** 2 - 1
+    missing = gaussians.shN.new_zeros(len(gaussians), max(0, bands - gaussians.shN.shape[1]), 3)
+    return replace(gaussians, shN=torch.cat([gaussians.shN[:, :bands], missing], dim=1))

@@ -16,18 +16,13 @@ from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.ply import read_header
 from turbogs_plugin.types import SH_C0, Gaussians
 
-Code = Callable[[np.ndarray], np.ndarray]
 CHUNK = 256
 """Gaussians that share their bounds in a compressed .ply."""
 LEAST_OPACITY = 1.0 / 255.0
 """gsplat's exporter leaves out of a compressed .ply what is not above it."""
 SPLAT_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
-BOUNDS = [
-    f"{end}_{axis}" for kind in ("", "scale_") for end in ("min", "max") for axis in (f"{kind}{a}" for a in "xyz")
-]
-COLOR_BOUNDS = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
-"""Older files lack these: their colours lie between 0 and 1."""
-WORDS = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
+PLY_TYPES = {"float": "<f4", "uint": "<u4", "uchar": "u1"}
+"""Type of a property in a compressed .ply -> numpy's."""
 
 
 def save_by_gsplat(kind: str, gaussians: Gaussians, path: Path, frame: Frame, step: int = 0) -> None:
@@ -54,22 +49,19 @@ def save_by_gsplat(kind: str, gaussians: Gaussians, path: Path, frame: Frame, st
 def read_splat(path: Path) -> Gaussians:
     """The model of a ``.splat``; float64, on the CPU. Raises `InputError` where the file is no such one."""
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from None
-    if not content or len(content) % SPLAT_ROW.itemsize:
-        said = f"{path} is not a .splat: its {len(content)} bytes are no rows of {SPLAT_ROW.itemsize}"
-        raise InputError(f"{said}; export it again, or name another file")
-    rows = np.frombuffer(content, dtype=SPLAT_ROW)
-    shares = rows["color"].astype(np.float64) / 255.0
-    return unpacked_model(
-        means=rows["mean"],
-        quats=(rows["quat"].astype(np.float64) - 128.0) / 128.0,
-        scales=np.log(np.maximum(rows["scale"], 1e-30)),
-        shares=shares[:, 3],
-        sh0=(shares[:, :3] - 0.5) / SH_C0,
-        shN=np.zeros((len(rows), 0, 3)),
-    )
+        rows = np.frombuffer(path.read_bytes(), dtype=SPLAT_ROW)
+        shares = rows["color"].astype(np.float64) / 255.0
+        return unpacked_model(
+            means=rows["mean"],
+            quats=(rows["quat"].astype(np.float64) - 128.0) / 128.0,
+            scales=np.log(np.maximum(rows["scale"], 1e-30)),
+            shares=shares[:, 3],
+            sh0=(shares[:, :3] - 0.5) / SH_C0,
+            shN=np.zeros((len(rows), 0, 3)),
+        )
+    except (OSError, ValueError):
+        said = f"{path} cannot be read as a .splat, which is rows of {SPLAT_ROW.itemsize}"
+        raise InputError(f"{said}; export it again, or name another file") from None
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
@@ -78,45 +70,45 @@ def read_compressed_ply(path: Path) -> Gaussians:
     Raises:
         InputError: the file is no such one.
     """
-    header, offset = read_header(path)
-    body = path.read_bytes()[offset:]
-    elements: dict[str, tuple[int, list[str]]] = {}
+    header, start = read_header(path)
+    content = path.read_bytes()
+    elements: dict[str, tuple[int, list[tuple[str, str]]]] = {}
+    tables: dict[str, np.ndarray] = {}
     try:
         for line in header:
-            words = line.split()
-            if words[:1] == ["element"]:
-                elements[words[1]] = (int(words[2]), [])
-            elif words[:1] == ["property"]:
-                elements[list(elements)[-1]][1].append(words[-1])
-        (chunks, bounds), (count, words) = elements["chunk"], elements["vertex"]
-        if sorted(bounds) not in (sorted(BOUNDS), sorted(BOUNDS + COLOR_BOUNDS)) or words != WORDS:
-            raise ValueError
-    except (ValueError, KeyError, IndexError):
-        raise InputError(f"{path} is not a compressed .ply of Gaussians: export it again") from None
-    also, rest = elements.get("sh", (count, []))  # SuperSplat leaves it out where there are no harmonics
-    sizes = (4 * len(bounds) * chunks, 4 * len(WORDS) * count, len(rest) * count)
-    shaped = (also, chunks) == (count, -(-count // CHUNK))
-    if not (count and shaped and len(rest) in (0, 9, 24, 45) and len(body) == sum(sizes)):
-        raise InputError(f"{path} is not a whole compressed .ply of Gaussians: export it again")
-    limits = np.frombuffer(body[: sizes[0]], dtype="<f4").reshape(chunks, len(bounds)).astype(np.float64)
-    of_row = limits[np.arange(count) // CHUNK]  # [N, 18], or [N, 12] without those of colours
-    column = {name: np.full(count, float(name.startswith("max"))) for name in COLOR_BOUNDS}
-    column |= {name: of_row[:, place] for place, name in enumerate(bounds)}
-    position, rotation, scale, color = np.frombuffer(body[sizes[0] : sizes[0] + sizes[1]], dtype="<u4").reshape(-1, 4).T
+            match line.split():
+                case ["element", name, count]:
+                    fields: list[tuple[str, str]] = []
+                    elements[name] = (int(count), fields)
+                case ["property", kind, name]:
+                    fields.append((name, PLY_TYPES[kind]))
+        for name, (length, fields) in elements.items():
+            tables[name] = np.frombuffer(content, np.dtype(fields), length, start)
+            start += tables[name].nbytes
+        return _uncompressed(tables)
+    except (ValueError, KeyError, IndexError, UnboundLocalError):
+        raise InputError(f"{path} is not a compressed .ply of Gaussians, or not whole: export it again") from None
 
-    def spread(shares: list[np.ndarray], names: str, kind: str = "") -> np.ndarray:
+
+def _uncompressed(tables: dict[str, np.ndarray]) -> Gaussians:
+    """The model of a compressed .ply's elements. Raises ValueError, KeyError or IndexError where they are others."""
+    rows = tables["vertex"]
+    bounds = tables["chunk"][np.arange(len(rows)) // CHUNK]  # [N]
+    harmonics = tables.get("sh", np.zeros((len(rows), 0), dtype=np.uint8))  # SuperSplat leaves out what is empty
+    codes = harmonics.view(np.uint8).reshape(len(rows), 3, -1)  # [N, 3, B]
+
+    def spread(shares: list[np.ndarray], *names: str) -> np.ndarray:
         """[N, 3] between the bounds of the row's chunk."""
-        lows, highs = ([column[f"{end}_{kind}{name}"] for name in names] for end in ("min", "max"))
-        return np.stack([low + share * (high - low) for low, high, share in zip(lows, highs, shares, strict=True)], 1)
+        limits = ((bounds[f"min_{name}"].astype(np.float64), bounds[f"max_{name}"]) for name in names)
+        return np.stack([low + share * (high - low) for (low, high), share in zip(limits, shares, strict=True)], 1)
 
-    colors = [(color >> shift & 255) / 255.0 for shift in (24, 16, 8, 0)]
-    codes = np.frombuffer(body[sizes[0] + sizes[1] :], dtype=np.uint8).reshape(count, 3, len(rest) // 3)
+    colors = [(rows["packed_color"] >> shift & 255) / 255.0 for shift in (24, 16, 8, 0)]
     return unpacked_model(
-        means=spread(_thirds(position), "xyz"),
-        quats=unpacked_rotations(rotation, even_component),
-        scales=spread(_thirds(scale), "xyz", "scale_"),
+        means=spread(_thirds(rows["packed_position"]), "x", "y", "z"),
+        quats=unpacked_rotations(rows["packed_rotation"], lambda codes: (codes / 1023.0 - 0.5) * np.sqrt(2.0)),
+        scales=spread(_thirds(rows["packed_scale"]), "scale_x", "scale_y", "scale_z"),
         shares=colors[3],
-        sh0=(spread(colors[:3], "rgb") - 0.5) / SH_C0,
+        sh0=(spread(colors[:3], "r", "g", "b") - 0.5) / SH_C0,
         shN=((codes + 0.5) / 256.0 - 0.5).transpose(0, 2, 1) * 8.0,
     )
 
@@ -126,25 +118,13 @@ def _thirds(words: np.ndarray) -> list[np.ndarray]:
     return [(words >> 21) / 2047.0, (words >> 11 & 1023) / 1023.0, (words & 2047) / 2047.0]
 
 
-def packed_rotations(quats: np.ndarray, encode: Code) -> np.ndarray:
-    """[N] uint32 of [N, 4] quaternions of any norm: the place of the largest component in 2 bits, then the others in
-    order in 10 bits each.
+def unpacked_rotations(words: np.ndarray, decode: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """[N, 4] unit quaternions of [N] uint32: the place of the largest component in 2 bits, then the other components in
+    their order in 10 bits each.
 
     Args:
-        encode: 0 .. 1023 for components within +-1 / sqrt(2).
+        decode: a component within +-1 / sqrt(2) of 10 bits.
     """
-    unit = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
-    largest = np.abs(unit).argmax(axis=1)
-    unit = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -unit, unit)
-    words = largest.astype(np.uint32)
-    for place in range(4):
-        code = encode(unit[:, place]).astype(np.uint32)
-        words = np.where(largest == place, words, words << np.uint32(10) | code)
-    return words.astype("<u4")
-
-
-def unpacked_rotations(words: np.ndarray, decode: Code) -> np.ndarray:
-    """[N, 4] of `packed_rotations`, with the inverse of its `encode`."""
     largest = words >> 30
     found = np.zeros((len(words), 4))
     for place in (3, 2, 1, 0):
@@ -156,27 +136,17 @@ def unpacked_rotations(words: np.ndarray, decode: Code) -> np.ndarray:
     return found
 
 
-def even_code(components: np.ndarray) -> np.ndarray:
-    """Components in even steps from -1 / sqrt(2) to 1 / sqrt(2)."""
-    return np.rint((components / np.sqrt(2.0) + 0.5) * 1023.0).clip(0, 1023)
-
-
-def even_component(codes: np.ndarray) -> np.ndarray:
-    """The component of an `even_code`."""
-    return (codes / 1023.0 - 0.5) * np.sqrt(2.0)
-
-
 def unpacked_model(
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    shares: np.ndarray,
-    sh0: np.ndarray,
-    shN: np.ndarray,
-    least: float = 1e-4,
+    means: np.ndarray, quats: np.ndarray, scales: np.ndarray, shares: np.ndarray, sh0: np.ndarray, shN: np.ndarray
 ) -> Gaussians:
     """A model in float64. Arguments as in `Gaussians`, but for `sh0` [N, 3] and the opacities: `shares` [N] of 0 .. 1,
-    which are brought to within `least` .. 1 - `least`."""
-    inside = shares.clip(least, 1.0 - least)
+    which are brought to within 1e-4 .. 1 - 1e-4.
+
+    Raises:
+        ValueError: no Gaussian, or harmonics of no degree 0 .. 3.
+    """
+    if not len(means) or shN.shape[1] not in (0, 3, 8, 15):
+        raise ValueError("no Gaussians, or harmonics of an unknown degree")
+    inside = shares.clip(1e-4, 1.0 - 1e-4)
     arrays = (means, quats, scales, np.log(inside / (1.0 - inside)), sh0[:, None], shN)
     return Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, dtype=np.float64)) for array in arrays))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import warnings
 from pathlib import Path
 from typing import BinaryIO
 
@@ -14,15 +12,13 @@ from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError, refusal
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.model.packed import read_compressed_ply
-from turbogs_plugin.model.similarity import Similarity, placed
+from turbogs_plugin.model.similarity import Similarity, in_capture, placed, rounding
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.ply import read_header, read_vertices
 from turbogs_plugin.types import Gaussians
 
-NUMPY_TYPES = {"float": "<f4", "double": "<f8"}
-"""Type of a property in the header -> numpy's."""
 POSITION_ERROR = 1e-6
-"""Largest rounding error of exported positions that is accepted, in units of the frame's scale."""
+"""Largest `rounding` of positions that are written as float."""
 
 
 def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None) -> None:
@@ -40,28 +36,18 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
     Raises:
         InputError: there is nothing to write, or the file cannot be written.
     """
-    path = Path(path)
-    frame = frame or Frame(np.zeros(3), 1.0)
-    rows = gaussians.map(lambda value: value.detach().cpu())
-    values = {name: value.numpy() for name, value in rows.items()}
-    values["means"] = frame.restore_points(values["means"])
-    values["scales"] = values["scales"] + math.log(frame.scale)
-    values["shN"] = values["shN"].transpose(0, 2, 1)
-
+    path, frame = Path(path), frame or Frame(np.zeros(3), 1.0)
+    rows = in_capture(gaussians, frame, path, double_means=True)
     groups = _property_groups(rows.shN.shape[1])
     kinds = dict.fromkeys(groups, "float")
-    if np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 > POSITION_ERROR * frame.scale:
+    if rounding(frame) > POSITION_ERROR:
         kinds["means"] = "double"
-    # A field for each parameter, not for each property: the rows are the same, and are filled ten times as fast.
-    table = np.zeros(len(rows), dtype=[(name, NUMPY_TYPES[kind], (len(groups[name]),)) for name, kind in kinds.items()])
-    for name, value in values.items():
-        table[name].reshape(value.shape)[...] = value
-    finite = np.logical_and.reduce([np.isfinite(table[name]).all(axis=1) for name in values])
-    if not finite.all():
-        warnings.warn(f"{int((~finite).sum())} of {len(rows)} Gaussians are not finite and left out", stacklevel=2)
-        table = table[finite]
-    if not len(table):
-        raise InputError(f"there are no Gaussians to write to {path}")
+    # A field for each parameter, not for each property: the rows have equal bytes, and are filled ten times as fast.
+    fields = [(name, {"float": "<f4", "double": "<f8"}[kind], (len(groups[name]),)) for name, kind in kinds.items()]
+    table = np.zeros(len(rows), dtype=fields)
+    for name, value in rows.items():
+        array = value.transpose(1, 2).numpy() if name == "shN" else value.numpy()
+        table[name].reshape(array.shape)[...] = array
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     header += [f"property {kind} {name}" for parameter, kind in kinds.items() for name in groups[parameter]]
 

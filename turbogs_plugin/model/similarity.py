@@ -20,7 +20,7 @@ from turbogs_plugin.types import Gaussians
 SAMPLED_DIRECTIONS = 64
 """Directions by which the rotation of harmonics is found; the largest degree has 7 functions."""
 LARGEST_ROUNDING = 1e-4
-"""Largest rounding error of positions in float32, in units of the frame's scale, that a file may have."""
+"""Largest `rounding` that a file of single precision may have."""
 
 
 @dataclass(frozen=True)
@@ -89,28 +89,35 @@ def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaus
     return _finite(rows, f"{source}: ")
 
 
-def in_capture(gaussians: Gaussians, frame: Frame, target: Path) -> Gaussians:
-    """A model as files of single precision have it: in the capture's own coordinates, float32 on the CPU.
+def in_capture(gaussians: Gaussians, frame: Frame, target: Path, double_means: bool = False) -> Gaussians:
+    """A model as files have it: in the capture's own coordinates, float32 on the CPU.
 
     Args:
         gaussians: those that are not finite are left out, with a warning that counts them.
         frame: of the model's coordinates.
         target: the file, for messages.
+        double_means: keep means in float64, which nothing is too far for.
 
     Raises:
         InputError: none is left, or the capture lies too far from its origin for float32.
     """
-    rows = _finite(gaussians.map(lambda value: value.detach().cpu().contiguous()))
-    if not len(rows):
-        raise InputError(f"there are no Gaussians to write to {target}")
-    if np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 > LARGEST_ROUNDING * frame.scale:
+    rows = gaussians.map(lambda value: value.detach().cpu().contiguous())
+    means = torch.from_numpy(frame.restore_points(rows.means.numpy()))
+    if not double_means and rounding(frame) > LARGEST_ROUNDING:
         raise InputError(
             f"the capture lies {np.abs(frame.center).max():.3g} units from its origin, too far for {target} in single "
             "precision: export with --format ply"
         )
-    rows.means = torch.from_numpy(frame.restore_points(rows.means.numpy())).float()
-    rows.scales = rows.scales + math.log(frame.scale)
+    means = means if double_means else means.float()
+    rows = _finite(replace(rows, means=means, scales=rows.scales + math.log(frame.scale)))
+    if not len(rows):
+        raise InputError(f"there are no Gaussians to write to {target}")
     return rows
+
+
+def rounding(frame: Frame) -> float:
+    """Largest rounding error of float32 at the frame's centre in the capture's own coordinates, in the frame's unit."""
+    return float(np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 / frame.scale)
 
 
 def _finite(gaussians: Gaussians, owner: str = "") -> Gaussians:

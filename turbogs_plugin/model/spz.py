@@ -2,8 +2,8 @@
 
 A gzip stream of a header of 16 bytes and of one array after the other: positions, opacities, colours, scales,
 rotations, harmonics. Axes are x right, y up, z backward, where a capture's are x right, y down, z forward: so y and z
-change their sign, in everything that depends on a direction. Version 4 needs another compressor; all readers of it read
-version 3, too.
+change their sign, in everything that depends on a direction. Version 4 needs another compressor; all its readers read
+version 3, too. Version 2 has coarser rotations and is not read.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import torch
 from turbogs_plugin.engine.reference.spherical_harmonics import basis
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
-from turbogs_plugin.model.packed import packed_rotations, unpacked_model, unpacked_rotations
+from turbogs_plugin.model.packed import unpacked_model, unpacked_rotations
 from turbogs_plugin.model.similarity import in_capture
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import too_large
@@ -64,7 +64,7 @@ def packed(gaussians: Gaussians) -> bytes:
         _bytes(opacities * 255.0),
         _bytes(values["sh0"][:, 0] * (COLOR_SCALE * 255.0) + 127.5),
         _bytes((values["scales"] + 10.0) * 16.0),
-        packed_rotations(values["quats"][:, [1, 2, 3, 0]] * [1.0, -1.0, -1.0, 1.0], _code).tobytes(),
+        _packed_rotations(values["quats"][:, [1, 2, 3, 0]] * [1.0, -1.0, -1.0, 1.0]).tobytes(),
         _bytes(harmonics * SH_SCALE + 128.0),
     ]
     return gzip.compress(b"".join(parts), GZIP_LEVEL, mtime=0)
@@ -74,16 +74,16 @@ def read_spz(path: Path) -> Gaussians:
     """A model in x right, y down, z forward; float64, on the CPU.
 
     Raises:
-        InputError: the file is not a whole one of this format, in version 2 or 3.
+        InputError: the file is not a whole one of this format, in version 3.
     """
     try:
         unpacker, content = zlib.decompressobj(wbits=31), path.read_bytes()
         header = unpacker.decompress(content, HEADER.size).ljust(HEADER.size, b"\0")
         magic, version, count, degree, bits, _, _ = HEADER.unpack(header)
-        if magic != MAGIC or version not in (2, 3) or degree > 3:
-            raise InputError(f"{path} is not a .spz of version 2 or 3 with harmonics up to degree 3: export it again")
-        bands, turning = (degree + 1) ** 2 - 1, 4 if version == 3 else 3
-        widths = (9, 1, 3, 3, turning, 3 * bands)
+        if (magic, version) != (MAGIC, VERSION) or degree > 3 or not count:
+            raise InputError(f"{path} is no .spz of version 3 with Gaussians of degree 3 or less: export it again")
+        bands = (degree + 1) ** 2 - 1
+        widths = (9, 1, 3, 3, 4, 3 * bands)
         size = count * sum(widths)
         if too_large(size):
             raise InputError(f"{path} announces {count} Gaussians, more than fit in the free memory: export it again")
@@ -97,11 +97,12 @@ def read_spz(path: Path) -> Gaussians:
         np.frombuffer(body[start:end], dtype=np.uint8).reshape(count, width)
         for start, end, width in zip(ends, ends[1:], widths, strict=False)
     )
+    words = np.ascontiguousarray(rotations).view("<u4")[:, 0]
     wide = np.zeros((count, 3, 4), dtype=np.uint8)
     wide[:, :, 1:] = means.reshape(count, 3, 3)  # in the upper bytes, so that the sign is theirs
     return unpacked_model(
         means=(wide.view("<i4")[:, :, 0] >> 8) / 2.0**bits * [1.0, -1.0, -1.0],
-        quats=(_rotations_of_words if version == 3 else _rotations_of_bytes)(rotations),
+        quats=(unpacked_rotations(words, _component) * [1.0, -1.0, -1.0, 1.0])[:, [3, 0, 1, 2]],
         scales=scales / 16.0 - 10.0,
         shares=opacities[:, 0] / 255.0,
         sh0=(colors / 255.0 - 0.5) / COLOR_SCALE,
@@ -116,28 +117,23 @@ def _flips(degree: int) -> np.ndarray:
     return torch.sign(basis(direction, degree) * basis(mirrored, degree))[0].numpy()
 
 
-def _code(components: np.ndarray) -> np.ndarray:
-    """Sign and size."""
-    size = np.floor(LARGEST_COMPONENT * np.abs(components) * math.sqrt(2.0) + 0.5).clip(0, LARGEST_COMPONENT)
-    return np.where(components < 0, size + LARGEST_COMPONENT + 1, size)
+def _packed_rotations(quats: np.ndarray) -> np.ndarray:
+    """[N] uint32 of [N, 4] quaternions of any norm, xyzw, as `unpacked_rotations` takes them with `_component`."""
+    unit = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
+    largest = np.abs(unit).argmax(axis=1)
+    unit = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -unit, unit)
+    sizes = np.floor(LARGEST_COMPONENT * np.abs(unit) * math.sqrt(2.0) + 0.5).clip(0, LARGEST_COMPONENT)
+    codes = np.where(unit < 0, sizes + LARGEST_COMPONENT + 1, sizes).astype(np.uint32)  # sign and size
+    words = largest.astype(np.uint32)
+    for place in range(4):
+        words = np.where(largest == place, words, words << np.uint32(10) | codes[:, place])
+    return words.astype("<u4")
 
 
 def _component(codes: np.ndarray) -> np.ndarray:
+    """Components of a unit quaternion, of a sign and a size."""
     size = (codes & LARGEST_COMPONENT) / (LARGEST_COMPONENT * math.sqrt(2.0))
     return np.where(codes > LARGEST_COMPONENT, -size, size)
-
-
-def _rotations_of_words(rotations: np.ndarray) -> np.ndarray:
-    """[N, 4] wxyz of version 3: x, y, z and w as `packed_rotations`, [N, 4] bytes."""
-    words = np.ascontiguousarray(rotations).view("<u4")[:, 0]
-    return (unpacked_rotations(words, _component) * [1.0, -1.0, -1.0, 1.0])[:, [3, 0, 1, 2]]
-
-
-def _rotations_of_bytes(rotations: np.ndarray) -> np.ndarray:
-    """[N, 4] wxyz of version 2: x, y and z in a byte each."""
-    xyz = (rotations / 127.5 - 1.0) * [1.0, -1.0, -1.0]
-    w = np.sqrt(np.maximum(0.0, 1.0 - np.square(xyz).sum(axis=1)))
-    return np.concatenate([w[:, None], xyz], axis=1)
 
 
 def _bytes(values: np.ndarray) -> bytes:

@@ -29,19 +29,13 @@ def with_cap(config: Config, cap: int) -> Config:
     return config.changed(density={"max_gaussians": cap})
 
 
-def lowered_cap(config: Config, cap: int) -> Config:
-    """The configuration with this cap, or its own if that is less. Raises as `with_cap`."""
-    return with_cap(config, min(cap, cap_of(config) or cap))
-
-
 def growth_room(config: Config) -> float:
     """How many times its cap a run may have while it grows.
 
     Args:
         config: with the run's iterations decided.
     """
-    train = config.train
-    return config.build("density").growth_room(Step(0, train.iterations, train.refine_until))
+    return config.build("density").growth_room(Step(0, config.train.written_iterations, config.train.refine_until))
 
 
 def without_growth(config: Config) -> Config:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import RATE_EXPONENT
@@ -36,10 +36,6 @@ CAMERA_PIXELS = 0.4
 displacement rather than the scene. Dropout gains at .48 to .67 (fox, snowmiku) and loses at .20 to .34."""
 DEVICE_SHARE = 0.5
 """Share of the device's memory for photos and maps: the rest is for the model, its optimizer, workspaces."""
-ITERATION_MS = (1.3, 4.1)
-"""A whole iteration on an H200: 150 thousand Gaussians and 3 views of a megapixel; 600 thousand and 10 views."""
-LONG_RUN = 20_000
-"""Iterations from which on the plan says how long that is, as nobody would expect it."""
 LONGEST = 30_000
 """Most iterations of `auto`, 3DGS's own length: 60 epochs of 500 training views. More would take minutes or hours that
 nobody has asked for; a time budget asks for them. Divided by the times that an iteration has the pixels of one
@@ -53,13 +49,8 @@ Several processes, whose steps are longer by the root of their number, need fewe
 Value = bool | int | float | str
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """A setting's value by the facts, None where the fact was not asked for; and the reason, with the number that
-    decides."""
-
-    value: Value | None
-    reason: str
+Verdict = tuple[Value, str]
+"""A setting's value by the facts, and the reason, with the number that decides."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +77,10 @@ class Decision:
 
 def decide(setting: str, facts: SceneFacts, config: Config) -> Decision:
     """A setting's value in a run: by the configuration or, where that is ``auto``, by the facts."""
-    present, verdict = value_of(config.to_mapping(), setting), RULES[setting](facts, config)
+    present, (value, reason) = value_of(config.to_mapping(), setting), RULES[setting](facts, config)
     if present == AUTO:
-        return Decision(setting, verdict.value, "auto", verdict.reason)
-    wanted = "" if verdict.value is None else f"{yaml_text(verdict.value)}, "
-    return Decision(setting, present, "set", f"auto: {wanted}{verdict.reason}")
+        return Decision(setting, value, "auto", reason)
+    return Decision(setting, present, "set", f"auto: {yaml_text(value)}, {reason}")
 
 
 def yaml_text(value: Value) -> str:
@@ -100,69 +90,69 @@ def yaml_text(value: Value) -> str:
 def wanted_background(facts: SceneFacts, config: Config) -> Verdict:
     """One that no model can imitate, where photos say what is empty."""
     if facts.transparent:
-        return Verdict("random", "photos are transparent: what is empty in them stays empty")
-    return Verdict("black", "photos are opaque")
+        return "random", "photos are transparent: what is empty in them stays empty"
+    return "black", "photos are opaque"
 
 
 def wanted_backdrop(facts: SceneFacts, config: Config) -> Verdict:
     """A far sphere behind the scene, where all cameras look the same way and much of it is seen by few."""
     if config.train.starts_from_model:
-        return Verdict(False, "train.init names a model, which is taken as it is")
+        return False, "train.init names a model, which is taken as it is"
     concentration, cap = facts.direction_concentration, cap_of(config)
     if 0 < cap <= BACKDROP_COUNT:
-        return Verdict(False, f"its {BACKDROP_COUNT} Gaussians leave no room within density.max_gaussians {cap}")
+        return False, f"its {BACKDROP_COUNT} Gaussians leave no room within density.max_gaussians {cap}"
     one_sided = concentration >= ONE_SIDED
-    return Verdict(one_sided, f"view directions concentrated to {concentration:.3f} {_sign(one_sided)} {ONE_SIDED}")
+    return one_sided, f"view directions concentrated to {concentration:.3f} {_sign(one_sided)} {ONE_SIDED}"
 
 
 def wanted_exposure(facts: SceneFacts, config: Config) -> Verdict:
     """A colour map for each photo, where photos show the same points differently bright, but much as those before and
     after them."""
     if facts.transparent:
-        return Verdict(False, "photos are transparent: their background has no exposure")
+        return False, "photos are transparent: their background has no exposure"
     if facts.exposure_views is None:
-        return Verdict(None, "compares the photos' exposures")
+        return False, "unless the photos' exposures say otherwise, which only auto compares"
     if 2 * facts.exposure_views < facts.train_views:
-        return Verdict(False, f"only {facts.exposure_views} of {facts.train_views} photos could be compared")
+        return (False, f"only {facts.exposure_views} of {facts.train_views} photos could be compared")
     spread, rest = facts.exposure_spread, facts.exposure_rest
     differ, told = spread >= EXPOSURE_STOPS, rest <= EXPOSURE_SHARE * spread
     reason = f"photos {spread:.2f} stops apart {_sign(differ)} {EXPOSURE_STOPS}"
     if differ:
         sign = "<=" if told else ">"
         reason += f", and {rest:.2f} from those before and after {sign} {EXPOSURE_SHARE} of that"
-    return Verdict(differ and told, reason)
+    return differ and told, reason
 
 
 def wanted_dropout(facts: SceneFacts, config: Config) -> Verdict:
     """Some of the Gaussians left out, where cameras are so inaccurate that a model learns the photos by heart."""
     error = facts.reprojection_error
     if error is None:
-        return Verdict(0.0, "no reconstruction says how accurate the cameras are")
+        return 0.0, "no reconstruction says how accurate the cameras are"
     inaccurate = error >= CAMERA_PIXELS
     reason = f"points {error:.2f} pixels from where photos show them {_sign(inaccurate)} {CAMERA_PIXELS}"
-    return Verdict(DROPOUT if inaccurate else 0.0, reason)
+    return DROPOUT if inaccurate else 0.0, reason
 
 
-def wanted_batch_for(facts: SceneFacts, config: Config) -> Verdict:
+def wanted_batch_for(facts: SceneFacts, config: Config) -> tuple[int, str]:
     """The batch of all processes, as far as that costs no error and an iteration can have so many different views."""
     count, views = facts.processes, facts.train_views
     most = config.schedule.get("max_views", config.schedule.get("views", 0))
     if count == 1 or not most:
-        return Verdict(1, "one process" if count == 1 else "the schedule has no number of views")
+        return 1, "one process" if count == 1 else "the schedule has no number of views"
     wanted = min(count, LARGEST_BATCH)
     fitting = max(1, min(wanted, min(views, MAX_VIEWS) // most))
     reason = f"{count} processes" + (f", of which a batch for {wanted} costs no error" if wanted < count else "")
     if fitting < wanted:
         bound = f"an iteration's {MAX_VIEWS}" if views > MAX_VIEWS else f"{views} training views"
         reason += f", but {fitting + 1} times {most} views > {bound}"
-    return Verdict(fitting, reason)
+    return fitting, reason
 
 
 def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
     """As many iterations as `train.epochs` take: error stops falling after epochs, not after iterations."""
     train, views = config.train, facts.train_views
-    batch = decide("train.batch_for", facts, config)
-    factor = batch.value if batch.made == "auto" else 1  # what is set is in the schedule already
+    # A batch that is set is in the schedule already.
+    factor = wanted_batch_for(facts, config)[0] if config.train.batch_for == AUTO else 1
     wanted = train.epochs * views / (factor * images_per_iteration(config, views))
     fewest = SHORTEST_SHARE * WRITTEN_FOR / factor**RATE_EXPONENT
     longest = max(LONGEST / factor, fewest)
@@ -174,12 +164,7 @@ def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
     if wanted > longest:
         looks = train.epochs * longest / wanted
         reason += f" take {wanted:.0f}; at most {longest:.0f}, where a pixel is sampled {looks:.1f} times"
-    if given >= LONG_RUN:
-        least, most = (given * milliseconds / 60_000 for milliseconds in ITERATION_MS)
-        reason += f": {least:.1f} to {most:.1f} min on an H200; --time-budget for less"
-        reason += " or more" if wanted > longest else ""
-        reason += "; hours or days on this CPU" if facts.device == "cpu" else ""
-    return Verdict(math.ceil(given / 100) * 100, reason)
+    return math.ceil(given / 100) * 100, reason
 
 
 def wanted_maps_place(facts: SceneFacts, config: Config) -> Verdict:
@@ -190,12 +175,10 @@ def wanted_maps_place(facts: SceneFacts, config: Config) -> Verdict:
     room = HOST_SHARE * facts.host_free_bytes
     in_file = f"> {HOST_SHARE:.0%} of {mebibytes(facts.host_free_bytes)} free on the host: in a file"
     if facts.device == "cpu" and facts.map_bytes > room:
-        return Verdict("host", f"{mebibytes(facts.map_bytes)} {in_file}")
+        return "host", f"{mebibytes(facts.map_bytes)} {in_file}"
     photos = facts.photo_bytes if config.train.photos_place == "device" else 0
-    verdict = _place(facts, facts.map_bytes, photos, "photos")
-    if verdict.value == "host" and facts.map_bytes > room:
-        return replace(verdict, reason=f"{verdict.reason}, {in_file}")
-    return verdict
+    place, reason = _place(facts, facts.map_bytes, photos, "photos")
+    return place, f"{reason}, {in_file}" if place == "host" and facts.map_bytes > room else reason
 
 
 def wanted_photos_place(facts: SceneFacts, config: Config) -> Verdict:
@@ -206,13 +189,13 @@ def wanted_photos_place(facts: SceneFacts, config: Config) -> Verdict:
 
 def _place(facts: SceneFacts, size: int, others: int, name_of_others: str) -> Verdict:
     if facts.device == "cpu":
-        return Verdict("device", "the device is the CPU, whose memory is the host's")
+        return "device", "the device is the CPU, whose memory is the host's"
     limit = facts.device_free_bytes if facts.memory_limit is None else min(facts.device_free_bytes, facts.memory_limit)
     fits = size + others <= DEVICE_SHARE * limit
     beside = f" beside {mebibytes(others)} of {name_of_others}" if others else ""
     which = "free" if limit == facts.device_free_bytes else "allowed"
     reason = f"{mebibytes(size)}{beside} {'<=' if fits else '>'} {DEVICE_SHARE:.0%} of {mebibytes(limit)} {which}"
-    return Verdict("device" if fits else "host", reason)
+    return "device" if fits else "host", reason
 
 
 def mebibytes(size: int) -> str:

@@ -18,10 +18,7 @@ class SceneFacts:
     """Numbers that the plan knows.
 
     Args:
-        scene: name of the capture.
-        train_views, test_views: numbers of views.
-        largest_photo: (width, height) of the training photo with the most pixels.
-        points: M, of the reconstruction.
+        train_views: number of training views.
         direction_concentration: norm of the mean unit viewing direction of the training cameras; 1: all look the same
             way, 0: all around.
         photo_bytes: of all photos, training and test.
@@ -37,11 +34,7 @@ class SceneFacts:
         reprojection_error: a median in pixels, see `Scene`; None: not known.
     """
 
-    scene: str
     train_views: int
-    test_views: int
-    largest_photo: tuple[int, int]
-    points: int
     direction_concentration: float
     photo_bytes: int
     map_bytes: int
@@ -75,17 +68,12 @@ def gather_facts(
         processes: that will train together.
         with_exposures: compare the photos' exposures, which takes longer than all else here.
     """
-    views, sizes = scene.train, scene.train.cameras.sizes
-    pixels, test_pixels = int(sizes.prod(axis=1).sum()), int(scene.test.cameras.sizes.prod(axis=1).sum())
-    width, height = sizes[sizes.prod(axis=1).argmax()].tolist()
+    views = scene.train
+    pixels, test_pixels = (int(part.cameras.sizes.prod(axis=1).sum()) for part in (scene.train, scene.test))
     gains = compare_exposures(views, scene.points) if with_exposures else None
     host_free = free_host_bytes()
     return SceneFacts(
-        scene=scene.name,
         train_views=len(views),
-        test_views=len(scene.test),
-        largest_photo=(width, height),
-        points=len(scene.points),
         direction_concentration=float(views.cameras.directions.double().mean(dim=0).norm()),
         photo_bytes=(PHOTO_BYTES + views.photos.transparent) * (pixels + test_pixels),
         map_bytes=MAP_BYTES * pixels,

@@ -22,7 +22,7 @@ import torch
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.error_maps import MAP_BYTES
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, growth_room, lowered_cap
+from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, cap_of, growth_room, with_cap
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import SETS
 from turbogs_plugin.scene.photos import PHOTO_BYTES
@@ -144,4 +144,5 @@ def within_memory(config: Config, scene: Scene) -> Config:
         return config
     sizes = (scene.train.cameras.sizes, scene.test.cameras.sizes)
     demand = MemoryDemand.of(config, *sizes, photo_bytes=scene.train.photos.stored.shape[1])
-    return lowered_cap(config, max(1, int(demand.gaussians(limit) / growth_room(config))))
+    fitting = max(1, int(demand.gaussians(limit) / growth_room(config)))
+    return with_cap(config, min(fitting, cap_of(config) or fitting))

@@ -137,7 +137,7 @@ def fit_gains(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> F
         weights: [E] > 0.
         count: V.
     """
-    gains = np.zeros((count, 3))
+    gains: Floats = np.zeros((count, 3))
     for _ in range(ROUNDS if len(pairs) else 0):
         residuals = gains[pairs[:, 0]] - gains[pairs[:, 1]] - ratios
         present = weights / np.maximum(SMALLEST_RESIDUAL, np.linalg.norm(residuals, axis=1))

@@ -155,4 +155,4 @@ def _plan(plan: Plan | None) -> str:
     if plan is None:
         return "The run's folder holds no plan."
     rows = ((decision.setting, decision.text, decision.made, decision.reason) for decision in plan.decisions)
-    return f"{plan.facts_text()}.\n\n{table(('setting', 'value', 'made', 'reason'), rows)}"
+    return table(("setting", "value", "made", "reason"), rows)

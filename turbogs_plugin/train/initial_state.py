@@ -8,8 +8,7 @@ from torch import Tensor
 from turbogs_plugin.captures.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.exposures import Exposures
-from turbogs_plugin.model.harmonics import with_degree
-from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points
+from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points, with_degree
 from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
 from turbogs_plugin.plan.photo_gains import compare_exposures
 from turbogs_plugin.scene import PosedImages, Scene

@@ -118,8 +118,7 @@ class PixelSamples:
             InputError: no such mask, one that is False everywhere, or not one view number for each image.
         """
         if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.dim() not in (2, 3):
-            found = f"{mask.dtype} {tuple(mask.shape)}" if isinstance(mask, Tensor) else type(mask).__name__
-            raise InputError(f"mask is {found}: expected a tensor of bool [H, W] or [K, H, W]")
+            raise InputError("mask is not a tensor of bool [H, W] or [K, H, W]")
         mask = mask[None] if mask.dim() == 2 else mask
         views, y, x = torch.nonzero(mask, as_tuple=True)
         return cls.from_coordinates(views, x, y, [(mask.shape[2], mask.shape[1])] * len(mask), view_ids)
@@ -153,11 +152,9 @@ class PixelSamples:
         if len(view_ids) != len(sizes) or len(set(view_ids)) < len(view_ids):
             raise InputError(f"view_ids = {view_ids} is not valid: expected {len(sizes)} different numbers of views")
         for name, value in (("views", views), ("x", x), ("y", y)):
-            if not isinstance(value, Tensor) or value.dtype.is_floating_point or value.dtype == torch.bool:
-                found = value.dtype if isinstance(value, Tensor) else type(value).__name__
-                raise InputError(f"{name} is {found}: expected a tensor of integers [P]")
-            if value.dim() != 1 or value.shape != x.shape or len(value) == 0:
-                raise InputError(f"{name} has shape {tuple(value.shape)}: expected [P] as x and y, P at least 1")
+            whole = isinstance(value, Tensor) and not value.dtype.is_floating_point and value.dtype != torch.bool
+            if not (whole and value.dim() == 1 and value.shape == x.shape and len(value)):
+                raise InputError(f"{name} is not a tensor of integers [P] as x and y, with P at least 1")
         views, x, y = views.long(), x.long(), y.long()
         inside = (views >= 0) & (views < len(sizes))
         widths, heights = torch.as_tensor(sizes, device=x.device)[views.clamp(0, len(sizes) - 1)].unbind(dim=-1)  # [P]
