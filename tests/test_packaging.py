@@ -56,8 +56,6 @@ def test_the_wheel_holds_every_module_and_configuration(wheel):
         assert f"{path}.py" in wheel or f"{path}/__init__.py" in wheel, name
     for path in sorted((ROOT / "configs").rglob("*.yaml")):
         assert f"turbogs_plugin/configs/{path.relative_to(ROOT / 'configs').as_posix()}" in wheel
-    for path in sorted((ROOT / "turbogs_plugin/export/web").iterdir()):
-        assert f"turbogs_plugin/export/web/{path.name}" in wheel
 
 
 def test_the_wheel_installs_nothing_but_turbogs_plugin(wheel):
