@@ -64,7 +64,7 @@ def time_command(arguments: Sequence[str]) -> WallRun:
     """
     with tempfile.TemporaryDirectory() as place:
         out = Path(place) / "run"
-        command = [sys.executable, "-m", "turbogs_plugin.cli", "train", *arguments, "--out", str(out)]
+        command = [sys.executable, "-m", "turbogs_plugin", "train", *arguments, "--out", str(out)]
         started = time.perf_counter()
         ended = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         seconds = time.perf_counter() - started
