@@ -43,16 +43,11 @@ def solve_raw_cholesky(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tens
     return torch.where((failed == 0).unsqueeze(-1), solution, torch.nan)
 
 
-def solve_float64(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
-    """Scaled Cholesky in float64 throughout, the yardstick."""
-    return lm_solvers.solve_scaled_cholesky(rows.double(), weights.double(), damping.double(), rhs.double())
-
-
 SOLVERS: dict[str, Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]] = {
     "raw Cholesky, float32": solve_raw_cholesky,
     "scaled Cholesky, float32": lm_solvers.solve_scaled_cholesky,
     "low rank, float32": lm_solvers.solve_low_rank,
-    "scaled Cholesky, float64": solve_float64,
+    "scaled Cholesky, float64": lambda *system: lm_solvers.solve_scaled_cholesky(*(part.double() for part in system)),
 }
 COLORS = ("#b3261e", "#1f5fa8", "#2e7d32", "#6d6d6d")
 
@@ -65,8 +60,7 @@ SIZE = 10
 SYSTEMS, BATCH, REPEATS = 2000, 100_000, 5
 """Systems of a family whose error is measured; systems solved at once, and how often, to measure the time."""
 
-FAILED_ERROR = 1.0
-"""Error from which a solution is worth less than no step at all, as one that is not finite."""
+FAILED_ERROR = 1.0  # a solution of a larger error is worth less than no step at all, as one that is not finite
 
 
 @dataclass(frozen=True)

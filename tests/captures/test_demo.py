@@ -70,7 +70,7 @@ def test_on_a_full_disk_it_is_refused_and_leaves_nothing(tmp_path, monkeypatch):
         (folder / "points3D.bin").write_bytes(b"")
 
     monkeypatch.setattr(pycolmap.Reconstruction, "write_binary", cut)
-    words = f"'{tmp_path}' cannot be written whole: make room there"
+    words = f"'{tmp_path / 'capture'}' cannot be written whole: make room there"
     assert_refused(words, write_demo_capture, tmp_path / "capture", views=3, width=16, height=12)
     assert not list(tmp_path.iterdir())
 

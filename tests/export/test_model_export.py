@@ -102,7 +102,8 @@ def test_an_export_of_fewer(turbogs, finished, tmp_path):
 
 def test_bad_input_is_one_line(turbogs, finished, capture, tmp_path):
     points = tmp_path / "points.ply"
-    points.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n")
+    places = "".join(f"property float {axis}\n" for axis in "xyz")
+    points.write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{places}end_header\n1 2 3\n")
     refused(turbogs("export", finished, "--format", "obj"), "--format obj", "compressed-ply")
     refused(turbogs("export", tmp_path, "--format", "spz"), "holds no run")
     refused(turbogs("export", finished, "--format", "html", "--out", tmp_path / "x.md"), "ends in .html")

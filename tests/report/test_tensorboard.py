@@ -117,26 +117,10 @@ def test_strips_are_small_and_may_be_none(writers, capture, tmp_path, monkeypatc
 
 def test_a_missing_package_is_named_before_anything_is_written(turbogs, capture, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    train = ("train", capture, "--out", tmp_path / "run", "--device", "cpu", *TINY, ASKED)
-    study = ("ablate", "components", "--scene", capture, "--out", tmp_path / "study", "--device", "cpu", ASKED)
-    for command in (train, study):
-        code, out, err = turbogs(*command)
-        assert (code, out) == (2, "") and err.count("\n") == 1, err
-        assert 'needs the package tensorboard: pip install "turbogs-plugin[tensorboard]"' in err
+    code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *TINY, ASKED)
+    assert (code, out) == (2, "") and err.count("\n") == 1, err
+    assert 'needs the package tensorboard: pip install "turbogs-plugin[tensorboard]"' in err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_cell_of_a_study_has_its_own(turbogs, writers, capture, tmp_path):
-    ablation = tmp_path / "two.yaml"
-    ablation.write_text("title: two\nbase: turbogs\nvariants:\n  a: []\n  b: [loss.ncc_weight=0.1]\n")
-    out = tmp_path / "study"
-    command = ("ablate", ablation, "--scene", capture, "--out", out, "--device", "cpu", *TINY, ASKED)
-    code, _, err = turbogs(*command)
-    assert code == 0, err
-    assert [writer.folder for writer in writers] == [str(out / f"tensorboard/capture/{v}--seed0") for v in "ab"]
-    assert all(writer.closed and {step for _, _, step in writer.scalars} == {0, 7, 14} for writer in writers)
-    turbogs(*command[:-1])  # the cells are finished: another value of it makes none of them again
-    assert len(writers) == 2
 
 
 def test_the_library_itself_shows_every_point_once(capture, tmp_path, monkeypatch):

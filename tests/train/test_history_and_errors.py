@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,10 +10,8 @@ import torch
 
 from turbogs_plugin.device import peak_memory_bytes
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.train import perceptual
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
 from turbogs_plugin.train.metrics import Metrics, ViewMetrics, compare, psnr, ssim
-from turbogs_plugin.train.perceptual import load_lpips
 from turbogs_plugin.train.progress import TrainingProgress
 
 FIELDS = {"iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians", "memory_bytes"}
@@ -91,43 +88,6 @@ def test_an_exact_image_and_a_small_one():
     assert compare("view", photo, photo).psnr == 100.0
     assert math.isnan(compare("view", photo[:8], photo[:8]).ssim)
     assert math.isnan(psnr(torch.full_like(photo, math.nan), photo)), "what cannot be compared does not fit"
-
-
-def test_lpips_says_why_it_is_missing(tmp_path, monkeypatch):
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    function, reason = load_lpips(None, torch.device("cpu"))
-    assert function is None and reason
-    with pytest.raises(InputError, match="no such file"):
-        load_lpips(str(tmp_path / "absent.pth"), torch.device("cpu"))
-    monkeypatch.setattr(perceptual, "LPIPS_PACKAGES", ("torch", "no_such_package"))
-    release = torch.__version__.partition("+")[0]
-    said = f"it needs no_such_package (pip install no_such_package torch=={release}) and the weights vgg16-"
-    assert load_lpips(None, torch.device("cpu"))[1].startswith(said)
-
-
-def test_lpips_is_loaded_once_a_process(tmp_path, monkeypatch):
-    """Before training, to try the file, and for the report."""
-    made = []
-
-    class Network(torch.nn.Module):
-        def __init__(self, **_) -> None:
-            super().__init__()
-            made.append(torch.hub.get_dir())
-
-        def forward(self, image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
-            return (image - photo).abs().mean()
-
-    module = SimpleNamespace(LearnedPerceptualImagePatchSimilarity=Network)
-    monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", module)
-    monkeypatch.setattr(perceptual, "LPIPS_PACKAGES", ())
-    perceptual._lpips_network.cache_clear()
-    (tmp_path / "w.pth").touch()
-    cache = torch.hub.get_dir()
-    for _ in range(2):
-        function, reason = load_lpips(str(tmp_path / "w.pth"), torch.device("cpu"))
-        assert reason == "" and function(torch.ones(4, 5, 3), torch.zeros(4, 5, 3)) == 1.0
-    assert len(made) == 1 and made[0] != cache == torch.hub.get_dir()
-    perceptual._lpips_network.cache_clear()
 
 
 def test_memory_is_that_of_this_process():

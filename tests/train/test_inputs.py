@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 from helpers.framework_runs import tiny_config
-from PIL import Image
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
@@ -33,17 +32,6 @@ def test_what_needs_no_photo(capture, tmp_path, begin, override, words):
     with pytest.raises(InputError, match=words):
         begin(tiny_config(capture, override), *([tmp_path / "run"] if begin is run.train else []))
     assert not (tmp_path / "run").exists()
-
-
-def test_a_factor_for_which_photos_are_too_small_is_refused_before_they_are_reconstructed(tmp_path, monkeypatch):
-    monkeypatch.setattr("turbogs_plugin.reconstruct.run.reconstruct", None)
-    photos = tmp_path / "walk"
-    photos.mkdir()
-    for number in range(3):
-        Image.new("RGB", (40, 24)).save(photos / f"{number}.png")
-    with pytest.raises(InputError, match=r"--factor 10 leaves too little of photos of 40x24.* is 6"):
-        run.train(tiny_config(photos, "scene.factor=10"), tmp_path / "run")
-    assert [entry.name for entry in tmp_path.iterdir()] == ["walk"]
 
 
 def test_a_folder_that_cannot_be_written_is_not_resumed(capture, tmp_path, monkeypatch):

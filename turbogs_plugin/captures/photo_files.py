@@ -135,6 +135,7 @@ def find_named(
         if not any(len(_like(index, PureWindowsPath(path), [""])) > 1 for path in filter(None, found)):
             missing = {place: PureWindowsPath(names[place]) for place, path in enumerate(found) if path is None}
             moved, _ = _moved(index, missing, folders)
+            moved = {place: path for place, path in moved.items() if path not in found}  # another name's photo
             if anywhere and not moved and not any(found):
                 moved, clear = _moved(index, missing, None)
                 moved = moved if clear else {}
