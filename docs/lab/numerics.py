@@ -30,7 +30,6 @@ from turbogs_plugin.report.provenance import hardware  # noqa: E402
 from turbogs_plugin.report.tables import table  # noqa: E402
 
 CPU = torch.device("cpu")
-
 Problem = tuple[Tensor, Tensor, Tensor, Tensor]
 """rows [K, n, D], weights [K, n], damping [n, D], rhs [n, D], as the solvers take them."""
 
