@@ -266,7 +266,7 @@ def _fill(
     params = [focal, focal, width / 2, height / 2]
     camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=width, height=height, params=params)
     reconstruction.add_camera_with_trivial_rig(camera)
-    positions = np.cumsum(visible, axis=1) - 1  # [V, M] number of a point among those of its view
+    positions = np.cumsum(visible, axis=1) - 1  # [V, M] number of a point among the points of its view
     for view in range(views):
         name = PHOTO_NAME.format(view)
         image = pycolmap.Image(name, keypoints=pixels[view, visible[view]], camera_id=1, image_id=view + 1)

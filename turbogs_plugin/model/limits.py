@@ -63,7 +63,7 @@ class Clearance:
 
     @torch.no_grad()
     def clear(self, update: RowUpdate, gaussians: Gaussians) -> RowUpdate:
-        """The same change without the rows that would lie in a sphere. To be called before the change is applied.
+        """`update` without the rows that would lie in a sphere. To be called before the change is applied.
 
         Args:
             update: a change of `gaussians`.

@@ -30,7 +30,7 @@ def save_by_gsplat(kind: str, gaussians: Gaussians, path: Path, frame: Frame, st
 
     Args:
         kind: ``splat``, which keeps no harmonics above degree 0, or ``ply_compressed``. Both sort the Gaussians;
-            the second leaves out those of an opacity of 1/255 or less.
+            the second leaves out Gaussians of an opacity of 1/255 or less.
         gaussians, path, frame: as for `in_capture`.
         step: has no place in these formats.
 

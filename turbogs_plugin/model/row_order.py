@@ -20,7 +20,7 @@ SPREADS = (
 
 
 def in_order_of_space(update: RowUpdate, gaussians: Gaussians, step: Step) -> RowUpdate:
-    """The same change with its new rows sorted in space. To be called before the change is applied.
+    """`update` with its new rows sorted in space. To be called before the change is applied.
 
     Kernels read the splats of a tile, and add to them, by row; so splats seen together should be near in memory. After
     `Step.refine_until` the change stays as it is: Gaussians are then only removed, which leaves the others in order.

@@ -52,7 +52,7 @@ class Similarity:
         return Similarity(self.rotation @ first.rotation, self.scale * first.scale, moved)
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
-        """The same model in the new coordinates, in its own dtype. Without a rotation, quaternions and harmonics keep
+        """The model in the new coordinates, in its own dtype. Without a rotation, quaternions and harmonics keep
         their bits."""
         rotation = torch.from_numpy(self.rotation).to(gaussians.means)
         translation = torch.from_numpy(self.translation).to(gaussians.means)

@@ -37,7 +37,7 @@ SH_SCALE = 128.0
 degree 1 and of those above, which a reader does not notice: the small coefficients of a capture whose cameras look one
 way all became 0."""
 LARGEST_COMPONENT = 511
-"""Of a quaternion's three stored components: 9 bits and a sign, for 0 .. 1 / sqrt(2)."""
+"""Largest code of each of a quaternion's three stored components: 9 bits and a sign, for 0 .. 1 / sqrt(2)."""
 GZIP_LEVEL = 6
 
 

@@ -69,8 +69,8 @@ def save_plain(path: Path, state: Any) -> None:
 
 
 def _alone(value: Any) -> Any:
-    """The same, with tensors of a GPU that are parts of a larger storage copied to the host, as torch saves whole
-    storages. Those of the host are left: maps there may lie in files."""
+    """`value` with tensors of a GPU that are parts of a larger storage copied to the host, as torch saves whole storages.
+    Tensors of the host are left: maps there may lie in files."""
     if isinstance(value, dict):
         return {key: _alone(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

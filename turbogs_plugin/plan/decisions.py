@@ -134,7 +134,7 @@ def wanted_dropout(facts: SceneFacts, config: Config) -> Verdict:
 
 
 def wanted_batch_for(facts: SceneFacts, config: Config) -> tuple[int, str]:
-    """The batch of all processes, as far as that costs no error and an iteration can have so many different views."""
+    """The batch of all processes, as far as that costs no error and an iteration can have as many different views."""
     count, views = facts.processes, facts.train_views
     most = config.schedule.get("max_views", config.schedule.get("views", 0))
     if count == 1 or not most:

@@ -69,8 +69,8 @@ class PhotoGains:
 
     @property
     def rest(self) -> float:
-        """Standard deviation of the gains from those of the photos before and after. A camera's automatic that follows
-        the light leaves little; exposures at random leave more than there was."""
+        """Standard deviation of the gains from the gains of the photos before and after. A camera's automatic that
+        follows the light leaves little; exposures at random leave more than there was."""
         return _deviation(self.left[self.compared])
 
 

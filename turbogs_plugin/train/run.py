@@ -37,7 +37,10 @@ IMPORTS, CAMERAS = "interpreter and imports", "cameras of photos alone"
 
 
 def plan_run(config: Config, processes: int = 1) -> Plan:
-    """The plan that `train` would make now for so many processes that train together. The capture's notes are printed.
+    """The plan that `train` would make now. The capture's notes are printed.
+
+    Args:
+        processes: number of processes that would train together.
 
     Raises:
         InputError: as `train`.

@@ -193,7 +193,7 @@ def _read(file: Path) -> tuple[Gaussians, Similarity | None]:
         files = [file, *_other_ranks(file)]
         parts = [read_gsplat(read_plain(part, f"'{part}'", REMEDY), part) for part in files]
         if len({part.shN.shape[1] for part in parts}) > 1:
-            raise InputError(f"{file}: the files of its ranks differ in degree: give those of one run")
+            raise InputError(f"{file}: the files of its ranks differ in degree: give the files of one run")
         names = PARAMETER_NAMES
         return Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names}), None
     try:

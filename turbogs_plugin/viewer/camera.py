@@ -75,7 +75,7 @@ class ViewerCamera:
         return rotation_matrices(torch.tensor(self.wxyz, dtype=torch.float64)).numpy()
 
     def with_at_most(self, pixels: float) -> ViewerCamera:
-        """The same view in an image of at most `pixels` pixels."""
+        """The view in an image of at most `pixels` pixels."""
         scale = min(1.0, math.sqrt(pixels / (self.width * self.height)))
         width, height = (max(SMALLEST_SIDE, int(side * scale)) for side in (self.width, self.height))
         return replace(self, width=width, height=height)
