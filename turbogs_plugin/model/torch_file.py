@@ -69,7 +69,7 @@ def save_plain(path: Path, state: Any) -> None:
 
 
 def _alone(value: Any) -> Any:
-    """`value` with tensors of a GPU that are parts of a larger storage copied to the host, as torch saves whole storages.
+    """`value` with tensors of a GPU that are parts of a larger storage copied to the host: torch saves whole storages.
     Tensors of the host are left: maps there may lie in files."""
     if isinstance(value, dict):
         return {key: _alone(item) for key, item in value.items()}
