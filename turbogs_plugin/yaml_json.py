@@ -133,7 +133,7 @@ def _parsed(text: str, where: str) -> dict[str, Any]:
 def _refuse_unsafe(text: str, where: str) -> None:
     depth, roots = 0, []
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        place = f"{where} (line {event.start_mark.line + 1})"
+        place = f"{where} (line {event.start_mark.line + 1})" if event.start_mark else where
         if isinstance(event, yaml.AliasEvent) or (isinstance(event, yaml.NodeEvent) and event.anchor):
             raise InputError(f"{place}: anchors and aliases are not allowed")
         if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag:
