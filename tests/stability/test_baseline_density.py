@@ -16,6 +16,7 @@ from helpers.optimizers import all_finite, clone, equal, fill, make_gaussians, r
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from turbogs_plugin.strategies.density import fastgs as fastgs_density
 from turbogs_plugin.strategies.density.fastgs import FastGsDensity
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
 from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
@@ -51,8 +52,13 @@ def gsplats_ops_on_cpu(monkeypatch):
     monkeypatch.setattr(ops, "quat_scale_to_covar_preci", covariances_on_cpu)
 
 
+@pytest.fixture(autouse=True)
+def fastgs_prunes_at_each_interval(monkeypatch):
+    monkeypatch.setattr(fastgs_density, "PRUNE_EVERY", 1)
+
+
 def fastgs(**options) -> FastGsDensity:
-    return FastGsDensity(**{"refine_from": 100, "refine_every": 100, "prune_every": 100, **options})
+    return FastGsDensity(**{"refine_from": 100, "refine_every": 100, **options})
 
 
 MAKERS = {"gsplat_default": GsplatDefaultDensity, "fastgs": fastgs, "mcmc": GsplatMcmcDensity}
@@ -89,11 +95,7 @@ def test_nothing_was_visible(name, step):
     gaussians = make_gaussians(40, dtype=torch.float32)
     gaussians.opacities[:] = 1.0
     before = clone(gaussians)
-    result = follow(
-        controller(name, gaussians, prune_opa=0.0) if name == "gsplat_default" else controller(name, gaussians),
-        gaussians,
-        step,
-    )
+    result = follow(controller(name, gaussians), gaussians, step)
     if name == "mcmc":
         assert len(result) == (42 if step is EVENT else 40) and all_finite(result)
     else:

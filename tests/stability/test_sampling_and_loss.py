@@ -33,7 +33,8 @@ def test_training_on_any_errors_keeps_maps_and_samples_valid(
     maps = ErrorMaps(np.array(sizes))
     for view_id, (width, height) in enumerate(sizes):
         maps.initialise(view_id, torch.tensor(rng.choice(palette, width * height), dtype=torch.float32))
-    sampler = ErrorGuidedPixelSampler(*shares, unit=unit, importance=importance)
+    hard, stable = shares
+    sampler = ErrorGuidedPixelSampler(unit=unit, hard_ratio=hard, stable_ratio=stable, importance=importance)
     views = tuple(rng.permutation(len(sizes)).tolist())
     for iteration in (starts, starts + 1, starts + 40_000):
         step = Step(iteration=iteration, total=10**6, refine_until=10**6, seed=seed)
