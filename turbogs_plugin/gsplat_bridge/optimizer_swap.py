@@ -8,8 +8,8 @@ moves.
 A member's ``state`` holds what is kept for its parameter, as gsplat's operations on rows expect: the moments are
 tensors with one row a Gaussian; "step", which they leave as it is, is one number. The bias correction counts steps of
 the host, as torch's Adam does, not updates of each Gaussian: a new Gaussian, whose moments are zero, then moves faster
-than its rate (`DenseAdam` says by how much), which hosts of few steps live on. Learning rate, betas and eps come from
-the member's own parameter group.
+than its rate (`GaussianMoments` says by how much), which hosts of few steps live on. Learning rate, betas and eps come
+from the member's own parameter group.
 """
 
 from __future__ import annotations
