@@ -63,19 +63,3 @@ def test_a_host_trains_in_a_process_group_of_one(process_group):
     host = Host(TurboDensityStrategy(), SharedOptimizer(SparseAdam()), tells_errors=True)
     losses = host.train(4)
     assert losses[-1] < losses[0]
-
-
-def test_a_group_that_forms_during_training_is_refused():
-    host = Host(TurboDensityStrategy(), SharedOptimizer(SparseAdam()))
-    host.step(0)
-    distributed.init_process_group("fake", store=FakeStore(), rank=0, world_size=2)
-    try:
-        with pytest.raises(InputError, match="works in one process"):
-            host.step(1)
-        for name in host.splats:
-            host.splats[name].grad = torch.ones_like(host.splats[name])
-        with pytest.raises(InputError, match=r"^SharedOptimizer works in one process"):
-            for member in host.optimizers.values():
-                member.step()
-    finally:
-        distributed.destroy_process_group()

@@ -65,15 +65,6 @@ def test_errors_of_other_images_are_refused(rendered):
         iteration_stats(info, COUNT)
 
 
-def test_info_of_several_processes_cameras_is_refused(rendered, monkeypatch):
-    """gsplat's distributed mode: the projection is of all processes' cameras, the tiles are of this one's."""
-    info, camera_of = stock_info(rendered, packed=False)
-    monkeypatch.setattr(gsplat, "rasterize_to_pixels", stand_in(camera_of))
-    info |= {key: info[key][:1] for key in ("isect_offsets", "prediction", "ground_truth")}
-    with pytest.raises(InputError, match=r"distributed=True, means2d of 2 cameras and tiles of 1: .*TurboDensityStrat"):
-        iteration_stats(info, COUNT)
-
-
 def test_info_without_a_gradient_on_the_screen_is_refused(rendered):
     """A render with the unscented transform gives such `info`; its weights are not splats'."""
     info, _ = stock_info(rendered, packed=False)

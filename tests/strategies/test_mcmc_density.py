@@ -3,7 +3,7 @@ replaced here by ones that change nothing; `stability/test_baseline_density.py` 
 
 import pytest
 import torch
-from gsplat.strategy import MCMCStrategy, ops
+from gsplat.strategy import ops
 from helpers.optimizers import make_gaussians
 
 from turbogs_plugin.errors import InputError
@@ -38,17 +38,6 @@ def test_what_is_added_has_the_step_count_of_what_it_was_copied_from():
     torch.testing.assert_close(after.sh0[COUNT:], before[update.source[COUNT:]])
     assert optimizer.moments.steps.tolist() == (update.source + 1).tolist()
     assert (optimizer.moments.exp_avg[COUNT:] == 0).all()
-
-
-def test_iterations_of_noise_alone_make_no_table_for_relocation(monkeypatch):
-    """gsplat's trainer makes its table of binomials once a run; made in every iteration, it would cost milliseconds."""
-    made = []
-    initialize_state = MCMCStrategy.initialize_state
-    monkeypatch.setattr(MCMCStrategy, "initialize_state", lambda self: made.append(1) or initialize_state(self))
-    gaussians = make_gaussians(COUNT, dtype=torch.float32)
-    for iteration in range(599, 602):
-        GsplatMcmcDensity(max_gaussians=COUNT).update(gaussians, Step(iteration, 5000, 3500))
-    assert len(made) == 1
 
 
 def test_a_cpu_is_refused():

@@ -247,14 +247,6 @@ def test_smallest_error_comes_before_zero_errors():
     assert (counts[100:110] == 400).all()
 
 
-def test_one_pixel_a_tile():
-    errors = torch.zeros(256)
-    errors[3] = 1.0
-    counts, samples = many_tiles(errors, iteration=3, rate=1e-9)
-    assert len(samples) == 400
-    assert 0.4 < counts[3] / 400 < 0.6  # the mixed stage's one: half by error, half by (equal) age
-
-
 def test_ages_past_sixteen_bits_still_rank():
     maps = ErrorMaps.from_images(torch.rand(1, 16, 16))
     sampler, visited = ErrorGuidedPixelSampler(hard_ratio=0.0, stable_ratio=1.0), 60_000
