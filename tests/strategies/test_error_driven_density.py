@@ -349,7 +349,7 @@ def test_the_cap_holds_at_the_end(cap, keep, every, choose_by, seen, far):
 )
 def test_runs_of_any_length_have_as_many_final_prunings(base, refine_until, every, prunings):
     """The last pruning leaves half an interval, however the length and what is scaled with it were rounded."""
-    for total in range(200, 12_000, 7):
+    for total in range(200, 12_000, 37):
         until, interval = round(refine_until * total / base), round(every * total / base)
         density = ErrorDrivenDensity(final_every=interval)
         at = [it for it in range(until + interval, total, interval) if density.due(Step(it, total, until))[1]]

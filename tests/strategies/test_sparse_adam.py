@@ -148,9 +148,8 @@ def test_only_updates_that_were_due_count_as_skipped(cls):
     assert int(optimizer.skipped) == 1
 
 
-@pytest.mark.parametrize("cls", ANY_OPTIMIZER)
+@pytest.mark.parametrize(("cls", "views"), [*((cls, 10) for cls in ANY_OPTIMIZER), (SparseAdam, 250)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("views", [10, 250])
 def test_survives_any_finite_gradient_and_scale(cls, dtype, views):
     """Up to the largest float, in runs long enough for the moments to fill; the state stays finite too. More views than
     a kernel takes do not cancel."""
