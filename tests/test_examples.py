@@ -6,7 +6,6 @@ The scripts take a GPU where there is one, and so do these tests.
 import importlib.util
 import json
 import math
-import os
 import re
 import shutil
 import sys
@@ -30,7 +29,6 @@ from turbogs_plugin.train.history import read_history
 from turbogs_plugin.types import PixelSamples, Step
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[2] / "shared" / "scenes"))
 PACKAGE = EXAMPLES / "third_party_strategy"
 SCRIPTS = ("density_swap", "optimizer_swap", "sparse_pixels", "all_swaps")
 
@@ -176,24 +174,6 @@ def test_third_party_fields_are_checked_like_our_own(third_party):
         build("density", {"type": "opaque_only", "least_opacity": 2.0})
 
 
-def test_checkerboards_of_two_iterations_are_every_pixel_once(third_party):
-    from turbogs_plugin.error_maps import ErrorMaps
-    from turbogs_plugin.types import Step
-
-    sampler = build("pixel_sampler", {"type": "checkerboard", "field_size": 3})
-    maps = ErrorMaps.from_images(torch.zeros(1, 21, 37))
-    seen = []
-    for iteration in range(2):
-        samples = sampler.sample(maps, (0,), 0.1, Step(iteration, 2, 2))
-        filled = samples.filled
-        assert samples.has_empty_slots  # or a GPU would divide by the number of slots
-        # Empty slots are last within each tile.
-        for start, end in zip(samples.tile_offsets[:-1].tolist(), samples.tile_offsets[1:].tolist(), strict=True):
-            assert not (~filled[start : end - 1] & filled[start + 1 : end]).any()
-        seen.append(samples.pixel_ids[filled])
-    assert torch.cat(seen).sort().values.tolist() == list(range(21 * 37))
-
-
 def test_not_installed_it_is_not_known():
     with pytest.raises(InputError, match=r"unknown pixel_sampler\.type 'checkerboard'"):
         build("pixel_sampler", {"type": "checkerboard"})
@@ -247,18 +227,6 @@ def require_same_capture(loaded: Scene, plain: Scene) -> None:
     difference = (theirs.permute(1, 2, 0) - photos[0])[shared]
     assert float(shared.float().mean()) > 0.9
     assert float(difference.square().mean().sqrt()) < 2.5 / 255
-
-
-@pytest.mark.skipif(not (SCENES / "fox-raw").is_dir(), reason=f"no real captures in {SCENES}")
-def test_fox_undistorted_by_colmap_is_the_capture_that_loading_makes(example, tmp_path):
-    """A few of its photos; those in between are as if they had never been published."""
-    folder = tmp_path / "raw"
-    (folder / "images").mkdir(parents=True)
-    shutil.copy(SCENES / "fox-raw/transforms.json", folder)
-    for photo in sorted((SCENES / "fox-raw/images").iterdir())[::17]:
-        shutil.copy(photo, folder / "images")
-    example("undistort_with_colmap").main(folder, tmp_path / "plain")
-    require_same_capture(load_scene(folder), load_scene(tmp_path / "plain"))
 
 
 def test_many_photos_are_a_capture_that_trains(example, tmp_path):
