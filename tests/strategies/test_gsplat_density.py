@@ -11,7 +11,6 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 from helpers.optimizers import make_gaussians
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
 from turbogs_plugin.types import RowUpdate, Step
 
@@ -130,9 +129,3 @@ def test_nothing_to_do_and_the_end():
     assert density.update(gaussians, Step(800, 1000, 800)) is None
     assert density.stats is None
     assert density.update(gaussians, Step(900, 1000, 800)) is None
-
-
-@pytest.mark.parametrize("values", [{"opacity_reset": "never"}, {"refine_every": 0}, {"refine_start_iter": -1}])
-def test_refuses(values):
-    with pytest.raises(InputError, match=next(iter(values))):
-        GsplatDefaultDensity(**values)

@@ -4,7 +4,6 @@ import math
 
 import pytest
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.schedule import (
     ExponentialSchedule,
     FixedSchedule,
@@ -79,21 +78,3 @@ def test_fixed(views, num_views, expected):
     for iteration in (0, 4999):
         budget = FixedSchedule(views=views).query(step(iteration), 0.1, 0.3, num_views)
         assert (budget.views, budget.rate) == (expected[0], pytest.approx(expected[1]))
-
-
-@pytest.mark.parametrize(
-    ("schedule", "values", "named"),
-    [
-        (SinusoidalSchedule, {"min_views": 12}, "max_views"),
-        (SinusoidalSchedule, {"min_views": 0}, "min_views"),
-        (LinearSchedule, {"pixel_budget": -1.0}, "pixel_budget"),
-        (LinearSchedule, {"pixel_budget": math.nan}, "pixel_budget"),
-        (LinearSchedule, {"alpha": -1.0}, "alpha"),
-        (ExponentialSchedule, {"max_views": 1}, "max_views"),
-        (FixedSchedule, {"views": 0}, "views"),
-        (FixedSchedule, {"pixel_budget": 0.0}, "pixel_budget"),
-    ],
-)
-def test_invalid_values_are_named(schedule, values, named):
-    with pytest.raises(InputError, match=named):
-        schedule(**values)

@@ -46,20 +46,6 @@ def test_all_rates_but_that_of_the_means_fall_to_their_share():
             assert getattr(at, name) == pytest.approx(3 * factor * getattr(rates, name))
 
 
-REFUSED = [
-    *((LearningRates, {name: value}) for name, value in (("shN", math.nan), ("means", 0.0), ("batch_scale", math.inf))),
-    *((SparseAdam, {name: value}) for name, value in (("beta1", 1.0), ("beta2", -0.1), ("eps", 0.0))),
-    *((MomentLMOptimizer, {name: value}) for name, value in (("units", "metres"), ("rows", "x"), ("curvature", -1.0))),
-    *((DenseAdam, {name: value}) for name, value in (("opacity_reg", -1.0), ("scale_reg", math.nan))),
-]
-
-
-@pytest.mark.parametrize(("cls", "values"), REFUSED)
-def test_impossible_values_are_refused_by_name(cls, values):
-    with pytest.raises(InputError, match=next(iter(values))):
-        cls(**values)
-
-
 def test_equals_torch_adam():
     gaussians = make_gaussians(7)
     rates = LearningRates(batch_scale=1.0)

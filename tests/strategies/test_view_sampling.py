@@ -153,8 +153,6 @@ def test_identical_cameras_are_all_drawn(extent):
     assert {view for draw in draws for view in draw} == set(range(5)) and all(len(set(draw)) == 2 for draw in draws)
 
 
-def test_misuse_is_named():
-    with pytest.raises(InputError, match="distance_weight"):
-        GeometryAwareViewSampler(distance_weight=-1.0)
+def test_an_extent_that_is_no_number_is_named():
     with pytest.raises(InputError, match="scene_extent"):
         GeometryAwareViewSampler().setup(orbit(3), float("nan"))
