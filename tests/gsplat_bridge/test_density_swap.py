@@ -392,10 +392,3 @@ def test_squares_and_absgrad_must_be_there_or_off():
 def test_invalid_fields_are_refused(field, value):
     with pytest.raises(InputError, match=field):
         TurboDensityStrategy(**{field: value})
-
-
-def test_gsplats_own_strategy_trains_on_our_rasterizer():
-    host = Host(DefaultStrategy(**SOON, absgrad=True))
-    losses = host.train(20)
-    assert losses[-1] < losses[0] and len(host.splats["means"]) > 40
-    host.assert_rows_match()
