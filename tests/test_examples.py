@@ -21,12 +21,11 @@ from PIL import Image
 from turbogs_plugin.captures import load_scene, write_demo_capture
 from turbogs_plugin.config.components import build
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train import run
 from turbogs_plugin.train.history import read_history
-from turbogs_plugin.types import PixelSamples, Step
+from turbogs_plugin.types import PixelSamples
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PACKAGE = EXAMPLES / "third_party_strategy"
@@ -115,13 +114,6 @@ def test_pixels_on_an_mlp(example, tmp_path, capsys):
     assert first[0].endswith("/photo.png") and [len(column) for column in first[1]["psnr"].values()] == [1, 1]
     psnr = dict(zip(first[1]["psnr"], [[20.0, 22.0], [21.0, 24.0]], strict=True))
     assert second[0] == "another" and second[1]["psnr"] == psnr and second[1]["provenance"]["machine"]
-
-
-def test_the_variants_of_pixels_on_an_mlp_draw_equally_many(example):
-    maps = ErrorMaps.from_images(torch.rand(1, 40, 50))
-    samplers = [variant.sampler for variant in example("pixels_on_an_mlp").VARIANTS]
-    counts = [len(sampler.sample(maps, 0, 0.1, Step(0, 9, 9))) for sampler in samplers]
-    assert counts[0] == counts[1] > 0
 
 
 @pytest.mark.usefixtures("plotted")
