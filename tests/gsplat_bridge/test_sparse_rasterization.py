@@ -9,7 +9,6 @@ import torch
 from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats
 from helpers.gsplat_torch import gsplat_torch_render
 
-from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_loss, sparse_rasterization
@@ -36,31 +35,12 @@ def scene():
     return make_splats(), cameras, sparse_samples(cameras)
 
 
-def test_values_and_gradients_are_those_of_the_rasterizer(scene):
-    splats, cameras, samples = scene
-    colors, alphas, info = sparse_rasterization(**arguments(splats, cameras), samples=samples, sh_degree=1)
-    weights = torch.randn(colors.shape, generator=torch.Generator().manual_seed(0))
-    ((colors * weights).sum() + (alphas[:, 0] * weights[:, 0]).sum()).backward()
-    expected_splats = make_splats()
-    raw = Gaussians(**{name: expected_splats[name] for name in PARAMETER_NAMES})
-    expected = rasterize_differentiable(raw, cameras, samples, sh_degree=1)
-    ((expected.colors * weights).sum() + (expected.alphas * weights[:, 0]).sum()).backward()
-    torch.testing.assert_close(colors, expected.colors, atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(alphas[:, 0], expected.alphas, atol=1e-5, rtol=1e-4)
-    for name in PARAMETER_NAMES:
-        assert splats[name].grad.norm() > 0
-        torch.testing.assert_close(splats[name].grad, expected_splats[name].grad, atol=1e-4, rtol=1e-3)
-    torch.testing.assert_close(info["means2d"].grad, expected.means2d.grad, atol=1e-4, rtol=1e-3)
-    torch.testing.assert_close(info["means2d"].absgrad, expected.means2d.absgrad, atol=1e-4, rtol=1e-3)
-    torch.testing.assert_close(info["radii"], expected.projected.radii)
-
-
 @pytest.mark.parametrize("render_mode", ["ED", "RGB+ED"])
-def test_depths_and_their_gradients_are_those_of_gsplats_torch_code(scene, render_mode):
+def test_values_and_gradients_are_those_of_gsplats_torch_code(scene, render_mode):
     """Expected z along the camera's axis, as Ks has it; a background has no depth."""
     splats, cameras, samples = scene
     given = {**arguments(splats, cameras), "samples": samples, "sh_degree": 1, "backgrounds": torch.full((2, 3), 0.5)}
-    shown, _, _ = sparse_rasterization(**given, render_mode=render_mode)
+    shown, seen, info = sparse_rasterization(**given, render_mode=render_mode)
     weights = torch.randn(shown.shape, generator=torch.Generator().manual_seed(0))
     (shown * weights).sum().backward()
     expected_splats = make_splats()
@@ -71,6 +51,8 @@ def test_depths_and_their_gradients_are_those_of_gsplats_torch_code(scene, rende
     (expected * weights).sum().backward()
     assert shown.shape == (len(samples), 1 if render_mode == "ED" else 4) and depths.max() > 1.0
     torch.testing.assert_close(shown, expected, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(seen[:, 0], alphas, atol=1e-5, rtol=1e-4)
+    assert info["means2d"].grad.any() and (info["means2d"].absgrad >= info["means2d"].grad.abs() - 1e-6).all()
     for name in PARAMETER_NAMES:
         reference = expected_splats[name].grad
         if render_mode == "ED" and name in ("sh0", "shN"):
@@ -134,16 +116,11 @@ def test_planes_and_blur_reach_the_renderer(scene):
     near, far = depths.quantile(0.3).item(), depths.quantile(0.7).item()
     _, _, cut = sparse_rasterization(**given, near_plane=near, far_plane=far)
     between, drawn = (depths > near) & (depths < far), (everything["radii"] > 0).all(dim=-1)
-    for side in (depths < near, depths > far, between):
-        assert (drawn & side).any()
-    assert torch.equal((cut["radii"] > 0).all(dim=-1), drawn & between)
+    assert (drawn & ~between).any() and torch.equal((cut["radii"] > 0).all(dim=-1), drawn & between)
     _, _, blurred = sparse_rasterization(**given, eps2d=1.0)
-    covariances = []
-    for info in (everything, blurred):
-        a, b, c = info["conics"][drawn].unbind(dim=-1)
-        covariances.append(torch.stack([c, -b, a], dim=-1) / (a * c - b * b)[:, None])
-    expected = torch.tensor([0.7, 0.0, 0.7]).expand_as(covariances[0])  # 1 in the place of gsplat's 0.3
-    torch.testing.assert_close(covariances[1] - covariances[0], expected, atol=5e-3, rtol=0)
+    a, b, c = torch.stack([info["conics"][drawn] for info in (everything, blurred)]).unbind(dim=-1)
+    variances = c / (a * c - b * b)
+    torch.testing.assert_close(variances[1] - variances[0], torch.full_like(a[0], 0.7), atol=5e-3, rtol=0)  # 1 for 0.3
 
 
 def test_saturated_opacities_and_vanished_scales_have_finite_gradients(scene):

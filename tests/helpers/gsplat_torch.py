@@ -17,8 +17,14 @@ def gsplat_torch_render(
     samples: PixelSamples,
     sh_degree: int | None = None,
     settings: RasterSettings = DEFAULT_SETTINGS,
+    offsets: list[tuple[Tensor, Tensor]] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours [P, 3], alphas [P] and expected depths [P] at the samples; zero in empty slots."""
+    """Colours [P, 3], alphas [P] and expected depths [P] at the samples; zero in empty slots.
+
+    Args:
+        offsets: list that takes each view's Gaussians [S] in the order of drawing, and the distances [n, S, 2] of their
+            means from the view's n pixels, whose gradients are the terms of the gradient on the screen.
+    """
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     covars, _ = _quat_scale_to_covar_preci(gaussians.quats, gaussians.scales.exp(), True, False)
     coefficients = torch.cat([gaussians.sh0, gaussians.shN], dim=1)
@@ -45,7 +51,10 @@ def gsplat_torch_render(
         order = depths.argsort(stable=True)
         order = order[(radii > 0).all(dim=-1)[order]]
         slots = torch.nonzero((views == view) & samples.filled).squeeze(-1)
-        dx, dy = (means2d[order] - places[slots][:, None]).unbind(dim=-1)  # [S, n]
+        distances = means2d[order] - places[slots][:, None]  # [n, S, 2]
+        if offsets is not None:
+            offsets.append((order, distances.requires_grad_()))
+        dx, dy = distances.unbind(dim=-1)
         a, b, c = conics[order].unbind(dim=-1)
         sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
         alphas = (opacities[order] * torch.exp(-sigma)).clamp(max=settings.alpha_max)

@@ -45,7 +45,7 @@ def make_samples(counts, empty=(), weights=None):
     )
 
 
-def random_case(seed=0, counts=(5, 9, 1, 26, 3), empty=(1, 0, 0, 4, 2), weighted=False, dtype=torch.float64):
+def random_case(seed=0, counts=(5, 9, 1, 12, 3), empty=(1, 0, 0, 4, 2), weighted=False, dtype=torch.float64):
     generator = torch.Generator().manual_seed(seed)
     slots = sum(counts)
     weights = torch.rand(slots, generator=generator) + 0.2 if weighted else None
