@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
-from turbogs_plugin.engine.rules import ParameterRates
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
 from turbogs_plugin.gsplat_bridge.host import host_gaussians, require_one_process
@@ -38,17 +37,6 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 
 MOST_SKIPPED = 100
 """Iterations in a row that may be skipped. A `GradScaler` halves its scale at each, so it needs a few dozen at most."""
-
-
-class _HostRates(LearningRates):
-    """The rates that the host's schedulers have set, whatever the step."""
-
-    def __init__(self, rates: ParameterRates) -> None:
-        super().__init__()
-        self.rates = rates
-
-    def at(self, step: Step) -> ParameterRates:
-        return self.rates
 
 
 class SharedOptimizer:
@@ -194,10 +182,10 @@ class SharedOptimizer:
                 raise InputError(
                     f"{option} differ between the members of one shared update: {values}; expected one value"
                 )
-        rates = ParameterRates(**{name: float(group["lr"]) for name, group in groups.items()})
+        rates = {name: float(group["lr"]) for name, group in groups.items()}
         (beta1, beta2), eps = betas["means"], epsilons["means"]
         check_moments_config(beta1, beta2, eps)
-        self.optimizer.learning_rates = _HostRates(rates)
+        self.optimizer.learning_rates = LearningRates(**rates, means_final=rates["means"], batch_scale=1.0)
         self.optimizer.beta1, self.optimizer.beta2, self.optimizer.eps = beta1, beta2, eps
 
     def _pack(self, gaussians: Gaussians) -> GaussianMoments:
