@@ -54,16 +54,26 @@ def gsplat_torch_render(
         distances = means2d[order] - places[slots][:, None]  # [n, S, 2]
         if offsets is not None:
             offsets.append((order, distances.requires_grad_()))
-        dx, dy = distances.unbind(dim=-1)
-        a, b, c = conics[order].unbind(dim=-1)
-        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-        alphas = (opacities[order] * torch.exp(-sigma)).clamp(max=settings.alpha_max)
-        alphas = torch.where((sigma >= 0) & (alphas >= settings.alpha_min), alphas, 0)
-        going = (1 - alphas).cumprod(dim=1) > settings.transmittance_min
-        alphas = torch.where(going, alphas, 0)
-        before = torch.cat([torch.ones_like(alphas[:, :1]), (1 - alphas).cumprod(dim=1)[:, :-1]], dim=1)
-        weights = alphas * before  # [S, n]
         values = torch.cat([colors[order], depths[order, None], torch.ones_like(depths[order, None])], dim=1)
-        result = result.index_add(0, slots, weights @ values)
+        result = result.index_add(0, slots, composited(distances, conics[order], opacities[order], values, settings))
     alphas = result[:, 4]
     return result[:, :3], alphas, result[:, 3] / alphas.clamp(min=1e-10)
+
+
+def composited(
+    distances: Tensor, conics: Tensor, opacities: Tensor, values: Tensor, settings: RasterSettings = DEFAULT_SETTINGS
+) -> Tensor:
+    """[n, D] what n pixels show of Gaussians [S] in the order of drawing.
+
+    Args:
+        distances: [n, S, 2] of the means from the pixels' centres.
+        conics: [S, 3]. opacities: [S] after sigmoid. values: [S, D].
+    """
+    dx, dy = distances.unbind(dim=-1)
+    a, b, c = conics.unbind(dim=-1)
+    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alphas = (opacities * torch.exp(-sigma)).clamp(max=settings.alpha_max)
+    alphas = torch.where((sigma >= 0) & (alphas >= settings.alpha_min), alphas, 0)
+    alphas = torch.where((1 - alphas).cumprod(dim=1) > settings.transmittance_min, alphas, 0)
+    before = torch.cat([torch.ones_like(alphas[:, :1]), (1 - alphas).cumprod(dim=1)[:, :-1]], dim=1)
+    return (alphas * before) @ values
