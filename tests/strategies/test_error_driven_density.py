@@ -7,24 +7,16 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers.optimizers import all_finite, busy_stats, fill, make_gaussians, random_stats
+from helpers.optimizers import all_finite, busy_stats, controlled, fill, make_gaussians, random_stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
-from turbogs_plugin.types import GaussianStats, Step
+from turbogs_plugin.types import Step
 
 FULL = Step(1200, 3500, 3500, seed=3, scene_extent=2.0)  # past `prune_size_from`; no final pruning follows
 QUIET = {"prune_world_size": 0.0, "prune_opacity": 0.0}
-
-
-def controlled(gaussians, stats: GaussianStats | None = None, **config) -> ErrorDrivenDensity:
-    density = ErrorDrivenDensity(**config)
-    density.setup(gaussians)
-    if stats is not None:
-        fill(density.stats, stats)
-    return density
 
 
 def rotation(quat: np.ndarray) -> np.ndarray:

@@ -29,21 +29,13 @@ ANY_OPTIMIZER = [*OPTIMIZERS, partial(DenseAdam, opacity_reg=0.01, scale_reg=0.0
 
 
 def test_rates_at_start_middle_and_end():
-    rates = LearningRates(means=1e-2, means_final=1e-4, batch_scale=3.0)
-    for iteration, expected in ((0, 1e-2), (500, 1e-3), (1000, 1e-4), (2000, 1e-4)):
+    rates = LearningRates(means=1e-2, means_final=1e-4, final_factor=0.04, batch_scale=3.0)
+    for iteration, means, factor in ((0, 1e-2, 1.0), (500, 1e-3, 0.2), (1000, 1e-4, 0.04), (2000, 1e-4, 0.04)):
         at = rates.at(Step(iteration, 1000, 700, scene_extent=5.0))
-        assert at.means == pytest.approx(3 * 5 * expected)
-        assert at.scales == pytest.approx(3 * rates.scales)
-    assert LearningRates(means=0, means_final=0).at(STEP).means == 0
-
-
-def test_all_rates_but_that_of_the_means_fall_to_their_share():
-    rates = LearningRates(final_factor=0.04, batch_scale=3.0)
-    for iteration, factor in ((0, 1.0), (500, 0.2), (1000, 0.04), (2000, 0.04)):
-        at = rates.at(Step(iteration, 1000, 700))
-        assert at.means == LearningRates(batch_scale=3.0).at(Step(iteration, 1000, 700)).means
+        assert at.means == pytest.approx(3 * 5 * means)
         for name in PARAMETER_NAMES[1:]:
             assert getattr(at, name) == pytest.approx(3 * factor * getattr(rates, name))
+    assert LearningRates(means=0, means_final=0).at(STEP).means == 0
 
 
 def test_equals_torch_adam():
