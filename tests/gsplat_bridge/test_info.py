@@ -39,8 +39,8 @@ def gsplat_radii(means2d, depths, conics, opacities):
 def gsplat_info(splats, cameras, pixels):
     """`info` after the backward pass of a mean absolute difference from pixels [P, 3] of whole images."""
     gaussians = Gaussians(**{name: splats[name].detach().double() for name in PARAMETER_NAMES})
-    cameras, offsets = cameras.to(dtype=torch.float64), []
-    colors, _, _ = gsplat_torch_render(gaussians, cameras, dense_samples(cameras), sh_degree=1, offsets=offsets)
+    cameras, drawn = cameras.to(dtype=torch.float64), []
+    colors, _, _ = gsplat_torch_render(gaussians, cameras, dense_samples(cameras), sh_degree=1, drawn=drawn)
     torch.nn.functional.l1_loss(colors, pixels.double()).backward()
     covariances, _ = _quat_scale_to_covar_preci(gaussians.quats, gaussians.scales.exp(), compute_preci=False)
     _, means2d, depths, conics, _ = _fully_fused_projection(
@@ -49,9 +49,9 @@ def gsplat_info(splats, cameras, pixels):
     radii = gsplat_radii(means2d, depths, conics, torch.sigmoid(gaussians.opacities).expand(depths.shape))
     means2d = means2d.float().requires_grad_()
     means2d.grad, means2d.absgrad = torch.zeros_like(means2d), torch.zeros_like(means2d)
-    for view, (order, distances) in enumerate(offsets):
-        means2d.grad[view, order] = distances.grad.sum(dim=0).float()
-        means2d.absgrad[view, order] = distances.grad.abs().sum(dim=0).float()
+    for view, one in enumerate(drawn):
+        means2d.grad[view, one.order] = one.distances.grad.sum(dim=0).float()
+        means2d.absgrad[view, one.order] = one.distances.grad.abs().sum(dim=0).float()
     sizes = {"width": WIDTH, "height": HEIGHT, "n_cameras": len(cameras)}
     return {"means2d": means2d, "radii": radii, "gaussian_ids": None, **sizes}
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats
-from helpers.gsplat_torch import composited
+from helpers.gsplat_torch import weights_of
 
 from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.gsplat_bridge import sparse_rasterization
@@ -16,7 +16,8 @@ def composite(means2d, conics, colors, opacities, order):
     """[H, W, D] one image: splats [S, ...] drawn in this order, as gsplat defines it."""
     y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     distances = means2d[order] - torch.stack([x, y], dim=-1).reshape(-1, 1, 2)  # [H * W, S, 2]
-    return composited(distances, conics[order], opacities[order], colors[order]).reshape(HEIGHT, WIDTH, -1)
+    weights, _ = weights_of(distances, conics[order], opacities[order])
+    return (weights @ colors[order]).reshape(HEIGHT, WIDTH, -1)
 
 
 def stand_in(camera_of):
