@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import fields
-from functools import cache
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from turbogs_plugin.errors import require, require_not_negative
@@ -16,7 +15,7 @@ def require_settings(instance: Any) -> None:
 
     A field of a `Literal` type has one of its values; a number is finite and >= 0. Call it after stricter checks.
     """
-    hints = _type_hints(type(instance))
+    hints = get_type_hints(type(instance))
     for name in [field.name for field in fields(instance) if field.init]:
         value = vars(instance)[name]
         if get_origin(hints[name]) is Literal:
@@ -24,10 +23,6 @@ def require_settings(instance: Any) -> None:
             require(value in allowed, name, value, f"one of {', '.join(allowed)}")
         elif isinstance(value, int | float):
             require_not_negative(instance, name)
-
-
-_type_hints: Callable[[Any], dict[str, Any]] = cache(get_type_hints)
-"""Cached, as it compiles every annotation, and a trainer may make a loss in each step."""
 
 
 def require_each(instance: Any, valid: Callable[[Any], bool], allowed: str, *names: str) -> None:
@@ -45,8 +40,3 @@ def require_at_least_one(instance: Any, *names: str) -> None:
 def require_positive(instance: Any, *names: str) -> None:
     """Raise `InputError` unless each of these attributes is a finite number above 0."""
     require_each(instance, lambda value: 0 < value < math.inf, "a finite number above 0", *names)
-
-
-def require_share(instance: Any, *names: str) -> None:
-    """Raise `InputError` unless each of these attributes is above 0 and at most 1."""
-    require_each(instance, lambda value: 0 < value <= 1, "more than 0 and at most 1", *names)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from turbogs_plugin.engine.rules import ParameterRates
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.errors import require
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.types import PARAMETER_NAMES, Step
 
@@ -43,11 +43,8 @@ class LearningRates:
 
     def __post_init__(self) -> None:
         require_settings(self)
-        if (self.means > 0) != (self.means_final > 0):
-            raise InputError(
-                f"learning rates means={self.means} and means_final={self.means_final}: "
-                "the decay is exponential, so use both > 0, or both 0 to hold the means"
-            )
+        allowed = f"above 0 as means ({self.means}) is, for the decay is exponential; or both 0 to hold the means"
+        require((self.means > 0) == (self.means_final > 0), "means_final", self.means_final, allowed)
 
     def at(self, step: Step) -> ParameterRates:
         """The rates at an iteration. Rates of the means are in world units (times `step.scene_extent`)."""

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-import operator
-from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from torch import Tensor
 
 from turbogs_plugin.engine import engine_of
-from turbogs_plugin.engine.layout import SAMPLE_UNITS
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.errors import require
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.protocols import PixelSampler
 from turbogs_plugin.tiles import TILE_PIXELS, dense_pixels
 from turbogs_plugin.types import PixelSamples, Step
@@ -35,28 +34,38 @@ def view_numbers(view_ids: ViewIds, maps: ErrorMaps) -> tuple[int, ...]:
         InputError: no view, not whole numbers, a view that the maps do not have, or one view twice.
     """
     plain = view_ids.tolist() if isinstance(view_ids, (Tensor, np.ndarray)) else view_ids
-    try:
-        numbers = tuple(operator.index(view) for view in (plain if isinstance(plain, Iterable) else (plain,)))
-    except TypeError:
-        numbers = ()
-    if not numbers or min(numbers) < 0 or max(numbers) >= len(maps.sizes):
-        raise InputError(
-            f"view_ids = {plain!r} is not valid: give whole numbers of views from 0 to {len(maps.sizes) - 1}"
-        )
-    if len(set(numbers)) < len(numbers):  # its pixels would be updated twice, and the sum of its errors be wrong
-        raise InputError(f"view_ids = {plain!r} is not valid: a batch has each view once")
-    return numbers
+    views, known = tuple(plain) if isinstance(plain, Iterable) else (plain,), range(len(maps.sizes))
+    # The pixels of a view that comes twice would be updated twice, and the sum of its errors be wrong.
+    valid = all(view in known for view in views) and 0 < len(set(views)) == len(views)
+    require(valid, "view_ids", plain, f"different whole numbers of views from 0 to {len(known) - 1}")
+    return tuple(map(int, views))
 
 
-class RulePixelSampler(PixelSampler):
-    """A sampler described by its rule alone: the engine of the maps' device draws."""
+@dataclass
+class RandomPixelSampler(PixelSampler):
+    """Uniformly random pixels of each tile (or tiles of each view), without replacement, by the `rule` alone: the
+    engine of the maps' device draws.
 
+    Args:
+        unit: `pixel`, as in the paper, or `tile`: whole tiles of a view, which begin elsewhere in each iteration
+            (`DrawRule.origin`).
+        multiple: samples of a tile are rounded to a multiple of this, where `unit` is `pixel`. The rasterizer takes 32
+            samples at once, and 33 in the time of 64. 1: the paper's number, rounded down.
+    """
+
+    unit: Literal["pixel", "tile"] = "pixel"
+    multiple: int = 1
     heeds_masks = True
 
+    def __post_init__(self) -> None:
+        require_settings(self)
+        divides = self.multiple >= 1 and TILE_PIXELS % self.multiple == 0
+        require(divides, "multiple", self.multiple, f"a divisor of {TILE_PIXELS}, the pixels of a tile")
+
     @property
-    @abstractmethod
     def rule(self) -> DrawRule:
-        """The draw as a rule for engines."""
+        """One stage, which ignores the maps."""
+        return DrawRule(self.unit, 0.0, 0.0, mixed_uniform=True, importance=0.0, multiple=self.multiple)
 
     def sample(self, maps: ErrorMaps, view_ids: ViewIds, rate: float, step: Step) -> PixelSamples:
         """Draw the share `rate` (r) of the pixels of each tile or, with `unit: tile`, of the tiles of each view.
@@ -67,31 +76,6 @@ class RulePixelSampler(PixelSampler):
         require(0 < rate < math.inf, "rate", rate, "finite and above 0")
         require(isinstance(step, Step), "step", step, "a Step, as Step(iteration=0, total=1000, refine_until=500) is")
         return engine_of(maps.errors.device).draw(self.rule, maps, view_numbers(view_ids, maps), rate, step)
-
-
-@dataclass
-class RandomPixelSampler(RulePixelSampler):
-    """Uniformly random pixels of each tile (or tiles of each view), without replacement.
-
-    Args:
-        unit: `pixel`, as in the paper, or `tile`: whole tiles of a view, which begin elsewhere in each iteration
-            (`DrawRule.origin`).
-        multiple: samples of a tile are rounded to a multiple of this, where `unit` is `pixel`. The rasterizer takes 32
-            samples at once, and 33 in the time of 64. 1: the paper's number, rounded down.
-    """
-
-    unit: str = "pixel"
-    multiple: int = 1
-
-    def __post_init__(self) -> None:
-        require(self.unit in SAMPLE_UNITS, "unit", self.unit, f"one of {', '.join(SAMPLE_UNITS)}")
-        divides = self.multiple >= 1 and TILE_PIXELS % self.multiple == 0
-        require(divides, "multiple", self.multiple, f"a divisor of {TILE_PIXELS}, the pixels of a tile")
-
-    @property
-    def rule(self) -> DrawRule:
-        """One stage, which ignores the maps."""
-        return DrawRule(self.unit, 0.0, 0.0, mixed_uniform=True, importance=0.0, multiple=self.multiple)
 
 
 @dataclass
@@ -109,7 +93,7 @@ class ErrorGuidedPixelSampler(RandomPixelSampler):
 
     hard_ratio: float = 0.4
     stable_ratio: float = 0.3
-    mixed: str = "error_age"
+    mixed: Literal["error_age", "uniform"] = "error_age"
     importance: float = 0.0
 
     def __post_init__(self) -> None:
@@ -117,7 +101,6 @@ class ErrorGuidedPixelSampler(RandomPixelSampler):
         require(0 <= self.hard_ratio <= 1, "hard_ratio", self.hard_ratio, "between 0 and 1")
         allowed = f"between 0 and 1 - hard_ratio ({1 - self.hard_ratio:g})"
         require(0 <= self.stable_ratio <= 1 - self.hard_ratio + 1e-9, "stable_ratio", self.stable_ratio, allowed)
-        require(self.mixed in ("error_age", "uniform"), "mixed", self.mixed, "error_age or uniform")
         require(0 <= self.importance <= 1, "importance", self.importance, "between 0 and 1")
 
     @property

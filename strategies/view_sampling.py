@@ -29,7 +29,7 @@ class RandomViewSampler:
     """
 
     stack: np.ndarray = field(init=False, repr=False, compare=False)  # the views left, int64
-    num_views: int = field(init=False, repr=False, default=0)  # V
+    num_views: int = field(init=False, repr=False)  # V
 
     def setup(self, cameras: Cameras, scene_extent: float) -> None:
         self.stack, self.num_views = np.zeros(0, dtype=np.int64), len(cameras)
@@ -42,8 +42,6 @@ class RandomViewSampler:
 
     def _fill(self, count: int, step: Step) -> int:
         """Fill the stack again if it holds fewer than `count` views. Returns `count`, at most V."""
-        if self.num_views == 0:
-            raise RuntimeError("a view sampler needs setup(cameras, scene_extent) before it is used")
         count = min(count, self.num_views)
         if len(self.stack) < count:
             self.stack = np.argsort(_uniforms(PURPOSE_STACK, self.num_views, step), kind="stable")

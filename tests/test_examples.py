@@ -6,7 +6,6 @@ The scripts take a GPU where there is one, and so do these tests.
 import importlib.util
 import json
 import math
-import os
 import re
 import shutil
 import sys
@@ -22,15 +21,12 @@ from PIL import Image
 from turbogs_plugin.captures import load_scene, write_demo_capture
 from turbogs_plugin.config.components import build
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import Scene
 from turbogs_plugin.train import run
 from turbogs_plugin.train.history import read_history
-from turbogs_plugin.types import PixelSamples, Step
+from turbogs_plugin.types import PixelSamples
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[2] / "shared" / "scenes"))
 PACKAGE = EXAMPLES / "third_party_strategy"
 SCRIPTS = ("density_swap", "optimizer_swap", "sparse_pixels", "all_swaps")
 
@@ -119,13 +115,6 @@ def test_pixels_on_an_mlp(example, tmp_path, capsys):
     assert second[0] == "another" and second[1]["psnr"] == psnr and second[1]["provenance"]["machine"]
 
 
-def test_the_variants_of_pixels_on_an_mlp_draw_equally_many(example):
-    maps = ErrorMaps.from_images(torch.rand(1, 40, 50))
-    samplers = [variant.sampler for variant in example("pixels_on_an_mlp").VARIANTS]
-    counts = [len(sampler.sample(maps, 0, 0.1, Step(0, 9, 9))) for sampler in samplers]
-    assert counts[0] == counts[1] > 0
-
-
 @pytest.mark.usefixtures("plotted")
 def test_baselines(example, thin_capture, tmp_path, capsys):
     example("baselines").main(scene=str(thin_capture), output=str(tmp_path / "runs"), iterations=44)
@@ -176,31 +165,13 @@ def test_third_party_fields_are_checked_like_our_own(third_party):
         build("density", {"type": "opaque_only", "least_opacity": 2.0})
 
 
-def test_checkerboards_of_two_iterations_are_every_pixel_once(third_party):
-    from turbogs_plugin.error_maps import ErrorMaps
-    from turbogs_plugin.types import Step
-
-    sampler = build("pixel_sampler", {"type": "checkerboard", "field_size": 3})
-    maps = ErrorMaps.from_images(torch.zeros(1, 21, 37))
-    seen = []
-    for iteration in range(2):
-        samples = sampler.sample(maps, (0,), 0.1, Step(iteration, 2, 2))
-        filled = samples.filled
-        assert samples.has_empty_slots  # or a GPU would divide by the number of slots
-        # Empty slots are last within each tile.
-        for start, end in zip(samples.tile_offsets[:-1].tolist(), samples.tile_offsets[1:].tolist(), strict=True):
-            assert not (~filled[start : end - 1] & filled[start + 1 : end]).any()
-        seen.append(samples.pixel_ids[filled])
-    assert torch.cat(seen).sort().values.tolist() == list(range(21 * 37))
-
-
 def test_not_installed_it_is_not_known():
     with pytest.raises(InputError, match=r"unknown pixel_sampler\.type 'checkerboard'"):
         build("pixel_sampler", {"type": "checkerboard"})
     assert importlib.util.find_spec("patchwork_strategies") is None
 
 
-def test_colmap_undistorts_to_the_cameras_and_pixels_that_loading_does(example, tmp_path):
+def test_colmap_undistorts_to_the_capture_that_loading_makes(example, tmp_path):
     """A capture with random points alone keeps them, too."""
     folder = tmp_path / "raw"
     (folder / "images").mkdir(parents=True)
@@ -221,62 +192,25 @@ def test_colmap_undistorts_to_the_cameras_and_pixels_that_loading_does(example, 
     (folder / "transforms.json").write_text(json.dumps({**lens, **bent, "frames": frames}))
     example("undistort_with_colmap").main(folder, tmp_path / "plain")
     loaded, plain = load_scene(folder), load_scene(tmp_path / "plain")
-    require_same_capture(loaded, plain)
-
-
-def require_same_capture(loaded: Scene, plain: Scene) -> None:
-    """Captures of one lens have equal poses and points, focal lengths within 0.5 %, and equal pictures but for
-    noise."""
     assert plain.train.names == loaded.train.names and plain.test.names == loaded.test.names
     assert torch.allclose(plain.train.cameras.viewmats, loaded.train.cameras.viewmats, atol=1e-5)
     assert torch.allclose(plain.points, loaded.points, atol=1e-5)
-    a, b = (scene.train.cameras.Ks[0].double().numpy() for scene in (loaded, plain))
-    np.testing.assert_allclose(a[[0, 1], [0, 1]], b[[0, 1], [0, 1]], rtol=5e-3)
-    sizes = [scene.train.cameras.sizes[0] for scene in (loaded, plain)]
+    Ks, sizes = ([getattr(scene.train.cameras, name)[0] for scene in (loaded, plain)] for name in ("Ks", "sizes"))
+    torch.testing.assert_close(Ks[0].diagonal(), Ks[1].diagonal(), rtol=5e-3, atol=0)
     assert np.abs(sizes[0] / sizes[1] - 1.0).max() < 0.02
-    for ours, theirs in zip(*(scene.train.photos.sizes for scene in (loaded, plain)), strict=True):
-        assert (ours == sizes[0]).all() and (theirs == sizes[1]).all()
-    # Our pixels, looked up in their photo where their camera sees the same direction.
-    photos = [scene.train.photos.image(0) for scene in (loaded, plain)]
-    height, width = photos[0].shape[:2]
-    y, x = np.mgrid[:height, :width] + 0.5
-    at_x, at_y = (((place - a[i, 2]) / a[i, i] * b[i, i] + b[i, 2]) for i, place in enumerate((x, y)))
-    grid = torch.from_numpy(np.stack([2 * at_x / sizes[1][0] - 1, 2 * at_y / sizes[1][1] - 1], axis=-1)).float()[None]
-    theirs = torch.nn.functional.grid_sample(photos[1].permute(2, 0, 1)[None], grid, align_corners=False)[0]
-    shared = (grid[0].abs() < 1 - 4 / min(sizes[1])).all(dim=-1)
-    difference = (theirs.permute(1, 2, 0) - photos[0])[shared]
-    assert float(shared.float().mean()) > 0.9
-    assert float(difference.square().mean().sqrt()) < 2.5 / 255
-
-
-@pytest.mark.skipif(not (SCENES / "fox-raw").is_dir(), reason=f"no real captures in {SCENES}")
-def test_fox_undistorted_by_colmap_is_the_capture_that_loading_makes(example, tmp_path):
-    """A few of its photos; those in between are as if they had never been published."""
-    folder = tmp_path / "raw"
-    (folder / "images").mkdir(parents=True)
-    shutil.copy(SCENES / "fox-raw/transforms.json", folder)
-    for photo in sorted((SCENES / "fox-raw/images").iterdir())[::17]:
-        shutil.copy(photo, folder / "images")
-    example("undistort_with_colmap").main(folder, tmp_path / "plain")
-    require_same_capture(load_scene(folder), load_scene(tmp_path / "plain"))
+    # Where both cameras look straight ahead, both photos show the same.
+    shown = []
+    for scene, K in zip((loaded, plain), Ks, strict=True):
+        x, y = K[:2, 2].int().tolist()
+        shown.append(scene.train.photos.image(0)[y - 20 : y + 20, x - 20 : x + 20])
+    assert float((shown[0] - shown[1]).abs().mean()) < 0.02
 
 
 def test_many_photos_are_a_capture_that_trains(example, tmp_path):
-    """The points lie in the photos where the cameras see them, whichever way the flight goes; and a run begins."""
     example("many_photos").write_flight(tmp_path / "flight", 60, 64, 48)
     scene = load_scene(tmp_path / "flight")
     assert (len(scene.train), len(scene.test)) == (52, 8) and len(scene.points) > 300
-    cameras, photos = scene.train.cameras, scene.train.photos
-    differences = []
-    for view in range(len(scene.train)):
-        seen = scene.points @ cameras.viewmats[view, :3, :3].T + cameras.viewmats[view, :3, 3]
-        pixels = (seen @ cameras.Ks[view].T)[:, :2] / seen[:, 2:]
-        inside = ((pixels > 0) & (pixels < torch.tensor([64.0, 48.0])) & (seen[:, 2:] > 0)).all(dim=1)
-        x, y = pixels[inside].long().T
-        found = photos.image(view)[y, x] * 255.0 - scene.point_colors[inside]
-        differences.append(found.abs().mean(dim=1))
-    assert torch.cat(differences).median() < 20.0 and len(torch.cat(differences)) > 500
-    axes = cameras.viewmats[:, 0, 0]
+    axes = scene.train.cameras.viewmats[:, 0, 0]  # to and fro
     assert (axes > 0.5).sum() > 15 and (axes < -0.5).sum() > 15
     config = load_config("turbogs", ["train.device=cpu", "train.iterations=1", "train.sh_degree=0"])
     config.scene.path = str(tmp_path / "flight")

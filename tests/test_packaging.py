@@ -45,6 +45,7 @@ def wheel(tmp_path_factory) -> list[str]:
         check=True,
         capture_output=True,
         env={**os.environ, "TURBOGS_CUDA": "off"},
+        timeout=300,
     )
     with zipfile.ZipFile(next(target.glob("*.whl"))) as archive:
         return archive.namelist()
@@ -94,32 +95,12 @@ def test_no_module_imports_one_that_imports_it():
     TopologicalSorter(graph).prepare()
 
 
-def test_strategies_are_one_set_of_classes_under_one_name():
-    from turbogs_plugin.strategies.losses import CharbonnierLoss
-
-    assert CharbonnierLoss.__module__ == "turbogs_plugin.strategies.losses"
-    found = subprocess.run(
-        [sys.executable, "-I", "-c", "import importlib.util; print(importlib.util.find_spec('strategies'))"],
-        cwd="/",
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert found.stdout.strip() == "None"
-
-
 def test_the_top_level_is_what_was_agreed():
-    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, timeout=60)
     if tracked.returncode:
         pytest.skip("not a git checkout")
     tops = {line.split("/")[0] for line in tracked.stdout.splitlines()}
     assert {top for top in tops if not top.startswith(".")} <= TOP_LEVEL
-
-
-def test_importing_the_command_line_does_not_import_torch():
-    code = "import sys, turbogs_plugin.cli; print('torch' in sys.modules)"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "False"
 
 
 @pytest.fixture
@@ -199,7 +180,8 @@ def test_a_compiler_that_fails_ends_without_a_library(tmp_path, mode):
     stale.touch()
     command = [sys.executable, "setup.py", "build_ext", "-b", tmp_path / "lib", "-t", tmp_path / "objects"]
     settings = {"TURBOGS_CUDA": mode, "TURBOGS_CUDA_ARCH": "90", "CUDA_HOME": tmp_path / "toolkit"}
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env={**os.environ, **settings})
+    environment = {**os.environ, **settings}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment, timeout=120)
     said = [line for line in (done.stdout + done.stderr).splitlines() if line.startswith("turbogs: ")]
     assert "Traceback" not in done.stderr and not stale.exists()
     assert (done.returncode == 0) == (mode == "auto"), done.stderr

@@ -145,22 +145,24 @@ train(load_config("config.yaml"), Path("run"))
 
 @pytest.fixture(scope="module")
 def loaded(tmp_path_factory) -> list[set[str]]:
-    """The modules that a new process has after the package and its clock, after the rooms of training and report, and
-    after a run without a report."""
+    """The modules that a new process has after the package, its clock and the command line, after the rooms of training
+    and report, and after a run without a report."""
     folder = tmp_path_factory.mktemp("rooms")
     config = tiny_config(tiny_capture(folder), "train.iterations=2", "train.evaluate_at=[]").to_yaml()
     (folder / "config.yaml").write_text(config)
-    parts = ("turbogs_plugin.train.clock", ", ".join(f"turbogs_plugin.{room}" for room in ROOMS))
+    parts = ("turbogs_plugin.train.clock, turbogs_plugin.cli", ", ".join(f"turbogs_plugin.{room}" for room in ROOMS))
     steps = ["import turbogs_plugin", *(f"import {part}" for part in parts), RUN]
     told = "\nimport json, sys\nprint(json.dumps(sorted(sys.modules)))\n"
     code = told.join(["\n".join(steps[:2]), *steps[2:], ""])
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder, timeout=300)
     assert ended.returncode == 0 and (folder / "run/model.ply").is_file(), ended.stderr
     return [set(json.loads(line)) for line in ended.stdout.splitlines() if line.startswith("[")]
 
 
-def test_the_package_and_the_clock_of_the_wall_load_no_torch(loaded):
-    assert "turbogs_plugin.train.clock" in loaded[0] and not loaded[0] & (SLOW | {"torch", "numpy"})
+def test_the_package_the_clock_of_the_wall_and_the_command_line_load_no_torch(loaded):
+    assert {"turbogs_plugin.train.clock", "turbogs_plugin.cli"} <= loaded[0] and not loaded[0] & (
+        SLOW | {"torch", "numpy"}
+    )
 
 
 def test_training_and_its_report_load_nothing_slow_before_they_use_it(loaded):

@@ -117,11 +117,6 @@ def test_what_an_install_changed(script):
     assert differences(before, after) == (["numpy 1.26.4 -> 2.4.6", "pycolmap 0.0.1 -> gone"], [])
 
 
-def test_packages_of_an_environment_are_all_but_this_one(script):
-    found = script("beside").packages(Path(sys.executable))
-    assert found["torch"] == importlib.metadata.version("torch") and "turbogs-plugin" not in found
-
-
 def test_a_clock_without_its_place_is_refused(script):
     with pytest.raises(SystemExit, match=r"set_random_seed.* is there 0 times: expected gsplat's simple_trainer"):
         script("measured").instrumented("global_tic = time.time()\n")

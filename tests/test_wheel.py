@@ -1,17 +1,12 @@
-"""`.ci/check_wheel.py` finds what is wrong with a wheel, and doctor names a GPU that the wheel has no code for."""
+"""`.ci/check_wheel.py` finds what is wrong with a wheel."""
 
 import importlib.util
 import re
 import struct
 import zipfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-import torch
-
-from turbogs_plugin import doctor
-from turbogs_plugin.engine.cuda import library as kernels
 
 ROOT = Path(__file__).resolve().parent.parent
 MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
@@ -85,28 +80,3 @@ def test_what_ties_a_library_to_a_version_is_named(checker, tmp_path, monkeypatc
     monkeypatch.setattr(checker, "undefined_symbols", lambda library: [*SYMBOLS, symbol])
     (fault,) = checker.faults(wheel(tmp_path, library(ARCHITECTURES)), ARCHITECTURES)
     assert fault.startswith(symbol)
-
-
-@pytest.mark.parametrize(
-    ("capability", "line"),
-    [
-        ((10, 3), None),
-        ((13, 0), None),  # by PTX
-        ((7, 5), "kernels: this GPU is sm_75: the kernels need compute capability 8.0 or newer"),
-        ((11, 0), "this GPU is sm_110: rebuild with TURBOGS_CUDA_ARCH=110"),
-    ],
-)
-def test_doctor_names_a_gpu_that_the_wheel_lacks(monkeypatch, capability, line):
-    names = (*(f"sm_{number}" for number in ARCHITECTURES), f"compute_{ARCHITECTURES[-1]}")
-    properties = SimpleNamespace(major=capability[0], minor=capability[1], name="Card", total_memory=2**34)
-    monkeypatch.setattr(kernels, "_load_failure", lambda: "")
-    monkeypatch.setattr(kernels, "architectures", lambda: names)
-    monkeypatch.setattr(kernels, "unavailable_reason", kernels.unavailable_reason.__wrapped__)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: capability)
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda index: properties)
-    said = doctor.diagnosis()
-    assert "Card, sm_{}{}".format(*capability) in said
-    assert ("kernels         loaded from" in said) == (line is None)
-    assert line is None or any(text.startswith("missing") and text.endswith(line) for text in said.splitlines())

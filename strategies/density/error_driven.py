@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_settings, require_share
+from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_settings
 from turbogs_plugin.strategies.density.growth import drawn_by_squares, split_in_two, squares_of
 from turbogs_plugin.strategies.density.rows import WindowedDensity, finite_rows, keep_one, removal
 from turbogs_plugin.types import Gaussians, RowUpdate, Step
@@ -115,13 +115,13 @@ class ErrorDrivenDensity(WindowedDensity):
 
     def __post_init__(self) -> None:
         require_at_least_one(self, "refine_every", "final_every")
-        require_share(self, "top_fraction", "final_keep")
+        require_each(self, lambda value: 0 < value <= 1, "more than 0 and at most 1", "top_fraction", "final_keep")
         shares = ("prune_opacity", "prune_score_fraction", "opacity_decay")
         require_each(self, lambda value: 0 <= value < 1, "at least 0 and less than 1", *shares)
         require_settings(self)
 
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        if self._stats is None or len(gaussians) == 0:
+        if self.stats is None or len(gaussians) == 0:
             return None
         densify, final = self.due(step)
         over = self.max_gaussians > 0 and len(gaussians) > self.bound(step)
@@ -133,9 +133,9 @@ class ErrorDrivenDensity(WindowedDensity):
                     update = self._refine(gaussians, step)
                 else:
                     update = self._prune(gaussians, step, 1 - self.final_keep if final else 0.0)
-            self._stats.zero_()
+            self.stats.zero_()
         if step.iteration >= self._last_event(step) and (reduce or not over):
-            self._stats = None
+            self.stats = None
         return update
 
     def scores(self, step: Step) -> tuple[Tensor, Tensor]:
@@ -171,7 +171,7 @@ class ErrorDrivenDensity(WindowedDensity):
         """A model beyond its bound is reduced at this iteration: after densification, where a time budget has made the
         run too short for a final pruning that was counted on."""
         after = step.iteration > step.refine_until and step.iteration % self.refine_every == 0
-        return after and self.max_gaussians > 0 and self._stats is not None
+        return after and self.max_gaussians > 0 and self.stats is not None
 
     def _last_event(self, step: Step) -> int:
         """Iteration after which no statistics are needed: the last event's, or the end of densification.
@@ -207,7 +207,7 @@ class ErrorDrivenDensity(WindowedDensity):
         if self.prune_score_fraction > 0:
             sound &= ~_lowest(worth, known & seen & ~spared, self.prune_score_fraction)
         keys = drawn_by_squares(self.window, step) if self.choose_by == "squares" else worth
-        order = _descending(keys)  # who grows first
+        order = keys.argsort(descending=True, stable=True)  # who grows first; of equal keys the lower rows
         candidates = self._passing(worth, seen) & sound
         if self.choose_by == "squares":
             candidates = _first(order, seen & sound, candidates.sum())
@@ -324,11 +324,6 @@ def _lowest(values: Tensor, mask: Tensor, share: float) -> Tensor:
     return mask & (values < _quantile(values, mask, share))
 
 
-def _descending(keys: Tensor) -> Tensor:
-    """[N] int64, the rows by their keys, the largest first; of equal keys the lower rows first."""
-    return torch.argsort(keys, descending=True, stable=True)
-
-
 def _first(order: Tensor, mask: Tensor, count: int | Tensor) -> Tensor:
     """[N] bool: the `count` rows of the mask (or all, if fewer) that come first in an order of all rows [N].
 
@@ -344,7 +339,7 @@ def _least(worth: Tensor, known: Tensor, present: Tensor, spared: Tensor, count:
     A Gaussian whose worth is not known counts as average, as nothing says that it is worth little.
     """
     average = torch.where(known, worth, 0.0).double().sum() / known.sum().clamp(min=1)  # the sum may overflow float32
-    order = _descending(-torch.where(known, worth, average.to(worth)))
+    order = torch.where(known, worth, average.to(worth)).argsort(stable=True)
     taken = _first(order, present & ~spared, count)
     return taken | _first(order, present & spared, count - taken.sum())
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
-from turbogs_plugin.strategies.density.rows import add_stats, finite_rows, keep_one, loaded_rows, removal, saved_rows
+from turbogs_plugin.strategies.density.rows import add_stats, finite_rows, keep_one, load_rows, removal
 from turbogs_plugin.strategies.protocols import DensityController
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
@@ -74,9 +74,8 @@ class FastGsDensity(DensityController):
     Until `Step.refine_until`, every `refine_every` iterations from `refine_from` on, a Gaussian is cloned or split
     where its screen gradient, or its absolute one, passes the threshold *and* at least `CONSISTENCY` of the batches
     that saw it marked it. Transparent and huge ones are pruned. Afterwards, every `PRUNE_EVERY` intervals, transparent
-    ones are pruned. Gaussians are pruned, too, whose blame (the sum of the mean errors of the batches that marked them)
-    exceeds `BLAME_THRESHOLD` of the largest, unless all have that much. Both kinds of event prune Gaussians that are
-    not finite. One Gaussian is always left.
+    ones are pruned. Gaussians are pruned, too, whose blame exceeds `BLAME_THRESHOLD` of the largest, unless all have
+    that much. Both kinds of event prune Gaussians that are not finite. One Gaussian is always left.
 
     Args:
         refine_from: first iteration of densification.
@@ -87,13 +86,12 @@ class FastGsDensity(DensityController):
     refine_every: int = 500
     watched = ("statistics",)  # an iteration's batch votes by its mean error, over all Gaussians
     _events: ErrorDrivenDensity = field(init=False, repr=False)
-    _batch: GaussianStats | None = field(init=False, repr=False, default=None)
-    _window: GaussianStats | None = field(init=False, repr=False, default=None)
-    _votes: ViewVotes | None = field(init=False, repr=False, default=None)
+    _batch: GaussianStats = field(init=False, repr=False)
+    _votes: ViewVotes = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         require_settings(self)
-        # The events of another controller. The gradients it is given decide which Gaussians may be densified.
+        # Another controller has the window, and the events. Its gradients decide which Gaussians may be densified.
         self._events = ErrorDrivenDensity(
             refine_from=self.refine_from,
             refine_every=self.refine_every,
@@ -106,14 +104,14 @@ class FastGsDensity(DensityController):
         )
 
     @property
-    def stats(self) -> GaussianStats | None:
+    def stats(self) -> GaussianStats:
         return self._batch
 
     def setup(self, gaussians: Gaussians) -> None:
         self._restart(len(gaussians), gaussians.device)
 
     def event_due(self, step: Step) -> bool:
-        return self._batch is not None and (self._events.due(step)[0] or self._prune_due(step))
+        return self._events.due(step)[0] or self._prune_due(step)
 
     def _prune_due(self, step: Step) -> bool:
         after = step.iteration - step.refine_until
@@ -121,60 +119,43 @@ class FastGsDensity(DensityController):
 
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        batch, window, votes = self._batch, self._window, self._votes
-        if batch is None or window is None or votes is None:
-            if not self._over(step):  # a time budget has made the run longer
-                self._restart(len(gaussians), gaussians.device)
+        self._votes.add(self._batch)
+        add_stats(self._events.window, self._batch)
+        self._batch.zero_()
+        if not self.event_due(step):
             return None
-        votes.add(batch)
-        add_stats(window, batch)
-        batch.zero_()
-        update = None
-        if self._events.due(step)[0]:
-            update = self._densify(gaussians, step, window, votes)
-        elif self._prune_due(step):
-            update = self._prune(gaussians, votes)
-        if self.event_due(step):
-            self._restart(len(gaussians), gaussians.device)
-        if self._over(step):
-            self._batch = self._window = self._votes = None
+        update = self._densify(gaussians, step) if self._events.due(step)[0] else self._prune(gaussians)
+        self._restart(len(gaussians), gaussians.device)
         return update
 
-    def _over(self, step: Step) -> bool:
-        """No event is left after this iteration, in a run of the present length."""
-        after, interval = step.iteration - step.refine_until, PRUNE_EVERY * self.refine_every
-        return after > 0 and step.iteration + interval - after % interval >= step.total
-
     def apply(self, update: RowUpdate) -> None:
-        if self._batch is not None:  # a window starts anew at each event
-            self._restart(len(update.source), update.source.device)
+        self._restart(len(update.source), update.source.device)  # a window starts anew at each event
 
     def state_dict(self) -> dict[str, Any]:
-        return {name: saved_rows(part) for name, part in self._parts().items()}
+        return {name: dict(vars(part)) for name, part in self._parts().items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        loaded = {name: loaded_rows(name, state[name], present) for name, present in self._parts().items()}
-        self._batch, self._window, self._votes = loaded.values()
+        for name, part in self._parts().items():
+            load_rows(name, part, state[name])
 
-    def _parts(self) -> dict[str, Any]:
-        return {"batch": self._batch, "window": self._window, "votes": self._votes}
+    def _parts(self) -> dict[str, GaussianStats | ViewVotes]:
+        return {"batch": self._batch, "window": self._events.window, "votes": self._votes}
 
     def _restart(self, count: int, device: torch.device) -> None:
-        self._batch, self._window = GaussianStats.zeros(count, device), GaussianStats.zeros(count, device)
+        self._batch, self._events.stats = (GaussianStats.zeros(count, device) for _ in range(2))
         self._votes = ViewVotes.zeros(count, device)
 
-    def _densify(self, gaussians: Gaussians, step: Step, window: GaussianStats, votes: ViewVotes) -> RowUpdate | None:
+    def _densify(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
+        window, votes = self._events.window, self._votes
         agreed = (votes.marked >= CONSISTENCY * votes.seen) & (votes.seen > 0)
         window.grad_sums *= agreed
         window.absgrad_sums *= agreed
-        self._events.setup(gaussians)
-        self._events.load_state_dict({"stats": vars(window)})
         return self._events.update(gaussians, step)
 
-    def _prune(self, gaussians: Gaussians, votes: ViewVotes) -> RowUpdate | None:
+    def _prune(self, gaussians: Gaussians) -> RowUpdate | None:
         if len(gaussians) == 0:
             return None
-        blame = votes.blame
+        blame = self._votes.blame
         blamed = blame > BLAME_THRESHOLD * blame.max()
         blamed &= ~blamed.all()  # all alike: nothing distinguishes them
         transparent = torch.sigmoid(gaussians.opacities) < self._events.prune_opacity

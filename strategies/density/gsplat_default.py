@@ -61,9 +61,9 @@ class GsplatDefaultDensity(WindowedDensity):
     @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         if step.iteration >= step.refine_until:
-            self._stats = None
+            self.stats = None
         reset_due = self._reset_due(step)
-        if self._stats is None or not self.event_due(step) or len(gaussians) == 0:
+        if self.stats is None or not self.event_due(step) or len(gaussians) == 0:
             return None
         usable = torch.nonzero(finite_rows(gaussians)).squeeze(-1)
         if len(usable) == 0:
@@ -72,12 +72,8 @@ class GsplatDefaultDensity(WindowedDensity):
             refine_start_iter=self.refine_start_iter, refine_every=self.refine_every, refine_stop_iter=step.refine_until
         )
         values = {name: value[usable] for name, value in gaussians.items()}
-        state: dict[str, Any] = {
-            "grad2d": self._stats.grad_sums,
-            "count": self._stats.view_counts,
-            "radii": self._stats.max_radii,
-        }
-        state = {name: rows[usable] for name, rows in state.items()}
+        sums = {"grad2d": self.stats.grad_sums, "count": self.stats.view_counts, "radii": self.stats.max_radii}
+        state: dict[str, Any] = {name: rows[usable] for name, rows in sums.items()}
         # gsplat treats the row numbers as one more running statistic.
         state |= {"source_row": usable, "scene_scale": step.scene_extent}
         params, optimizers = run_gsplat(strategy, values, state, step)

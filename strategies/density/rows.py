@@ -5,17 +5,15 @@ controller that changes nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.engine.moments import check_state
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.protocols import DensityController
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
-
-RowsType = TypeVar("RowsType")  # a dataclass of [N] tensors
 
 
 @dataclass
@@ -41,33 +39,30 @@ class NoDensity(DensityController):
 class WindowedDensity(DensityController):
     """A density control that keeps the statistics of a window of iterations, until it needs no more of them."""
 
-    _stats: GaussianStats | None = None
-
-    @property
-    def stats(self) -> GaussianStats | None:
-        return self._stats
+    stats: GaussianStats | None = None
 
     @property
     def window(self) -> GaussianStats:
         """The statistics. Raises RuntimeError, an error of the caller's code, where none are kept."""
-        if self._stats is None:
-            raise RuntimeError(
-                "density control keeps no statistics: call setup before, and nothing after its last event"
-            )
-        return self._stats
+        if self.stats is None:
+            raise RuntimeError("density control has no statistics before setup, nor after its last event")
+        return self.stats
 
     def setup(self, gaussians: Gaussians) -> None:
-        self._stats = GaussianStats.zeros(len(gaussians), gaussians.device)
+        self.stats = GaussianStats.zeros(len(gaussians), gaussians.device)
 
     def apply(self, update: RowUpdate) -> None:
-        if self._stats is not None:
-            self._stats = self._stats.map(update.apply_state)
+        if self.stats is not None:
+            self.stats = self.stats.map(update.apply_state)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"stats": saved_rows(self._stats)}
+        return {"stats": None if self.stats is None else dict(vars(self.stats))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._stats = loaded_rows("stats", state["stats"], self._stats)
+        if state["stats"] is None:  # after the last event
+            self.stats = None
+        else:
+            load_rows("stats", self.window, state["stats"])
 
 
 def add_stats(window: GaussianStats, new: GaussianStats) -> None:
@@ -80,31 +75,18 @@ def add_stats(window: GaussianStats, new: GaussianStats) -> None:
             total += value
 
 
-def saved_rows(rows: RowsType | None) -> dict[str, Tensor] | None:
-    """The state that `loaded_rows` takes: name of a field -> [N], or None."""
-    return None if rows is None else dict(vars(rows))
-
-
-def loaded_rows(name: str, saved: dict[str, Tensor] | None, present: RowsType | None) -> RowsType | None:
-    """Saved rows as copies on the device of the present ones, which must have the same number of Gaussians.
+def load_rows(name: str, rows: Any, saved: dict[str, Tensor]) -> None:
+    """Copy saved arrays over Gaussians into a dataclass of [N] tensors.
 
     Args:
-        name: of the entry, for the error message.
-        saved: from `saved_rows`; None if the saved run no longer needed them.
-        present: from `setup`.
+        name: of the part, for the error message.
+
+    Raises:
+        InputError: an array is missing, or of another number of Gaussians.
     """
-    if saved is None:
-        return None
-    if present is None:
-        raise InputError(f"density {name}: nothing to load into, call setup with the model of the saved run first")
-    like = next(iter(vars(present).values()))
-    for key, value in saved.items():
-        if value.shape != like.shape:
-            raise InputError(
-                f"density {name}.{key} has shape {tuple(value.shape)}, expected {tuple(like.shape)}: "
-                "load the state together with its own model"
-            )
-    return type(present)(**{key: value.to(like.device, copy=True) for key, value in saved.items()})
+    check_state(saved, vars(rows), f"density {name}")
+    for key, value in vars(rows).items():
+        value.copy_(saved[key])
 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:

@@ -29,10 +29,6 @@ class DenseAdam:
     - a Gaussian that no sample touched has a gradient of zero: its moments decay, and its momentum still moves it;
     - the bias correction counts iterations of the run, not updates of the Gaussian and those it was made of.
 
-    In both, a new Gaussian has moments of zero and hardly any correction, so it moves by more than the rate: with the
-    usual betas and a constant gradient by 3.2 rates at once, 6.5 rates after ten iterations, and 1.6 rates after five
-    hundred.
-
     Two things differ from `torch.optim.Adam`. An iteration whose samples touched nothing changes nothing; on the GPU,
     iterations that will be repeated are of this kind too. A Gaussian with a non-finite gradient is treated as
     untouched, and counted.
@@ -96,10 +92,9 @@ class DenseAdam:
                 getattr(moments, name).zero_()
 
     def state_dict(self) -> dict[str, Any]:
-        state: dict[str, Any] = {}
-        for moment in ("exp_avg", "exp_avg_sq"):
-            state |= {f"{moment}.{name}": value for name, value in getattr(self, moment).items()}
-        return {**state, "counts": self.counts, "skipped": self.skipped}
+        moments = {"exp_avg": self.exp_avg, "exp_avg_sq": self.exp_avg_sq}
+        rows = {f"{moment}.{name}": value for moment, values in moments.items() for name, value in values.items()}
+        return {**rows, "counts": self.counts, "skipped": self.skipped}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load a saved state. Raises `InputError` if its number of Gaussians or bands is another."""

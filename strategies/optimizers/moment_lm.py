@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from turbogs_plugin.engine.rules import MomentLMParams
-from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
 
@@ -53,10 +52,6 @@ class MomentLMOptimizer(SparseAdam):
     rows: Literal["views", "summed"] = "views"
     curvature: float = 0.5
     max_step: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_settings(self)
 
     @property
     def per_view(self) -> bool:

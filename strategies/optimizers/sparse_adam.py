@@ -10,6 +10,7 @@ from torch import Tensor
 from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
 from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.rules import MomentLMParams, UpdateRule
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.types import GaussianGradients, Gaussians, RowUpdate, Step
 
@@ -39,6 +40,7 @@ class SparseAdam:
 
     def __post_init__(self) -> None:
         check_moments_config(self.beta1, self.beta2, self.eps)
+        require_settings(self)
 
     @property
     def per_view(self) -> bool:

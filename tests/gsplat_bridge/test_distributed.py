@@ -1,81 +1,52 @@
 """Hosts of several processes are refused by each swap's name; a process group of one process changes nothing."""
 
+from contextlib import contextmanager
+
 import pytest
 import torch
-from helpers.bridge_host import Host, arguments, make_cameras, make_splats
+from helpers.bridge_host import Host
 from torch import distributed
 from torch.testing._internal.distributed.fake_pg import FakeStore
 
-from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_rasterization
+from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
 
-@pytest.fixture
-def process_group(request):
-    """The size of a process group; processes beside this one are torch's fake ones."""
-    size = request.param
+@contextmanager
+def process_group(size: int):
+    """Processes beside this one are torch's fake ones."""
     backend, store = ("gloo", distributed.HashStore()) if size == 1 else ("fake", FakeStore())
     distributed.init_process_group(backend, store=store, rank=0, world_size=size)
-    yield size
-    distributed.destroy_process_group()
+    try:
+        yield
+    finally:
+        distributed.destroy_process_group()
 
 
-def strategy_step():
-    strategy = TurboDensityStrategy()
-    info = {"means2d": torch.zeros(1, 4, 2, requires_grad=True) * 1.0}
-    strategy.step_pre_backward({}, {}, strategy.initialize_state(), 0, info)
-
-
-def strategy_step_after():
-    TurboDensityStrategy().step_post_backward({}, {}, {}, 10**6, {})
-
-
-def optimizer():
-    splats = make_splats()
-    SharedOptimizer(SparseAdam())([{"params": splats["means"], "lr": 1e-3, "name": "means"}])
-
-
-def render():
-    cameras = make_cameras(1)
-    sparse_rasterization(**arguments(make_splats(), cameras), samples=dense_samples(cameras), sh_degree=1)
-
-
-SWAPS = {
-    "step_pre_backward": ("TurboDensityStrategy", strategy_step),
-    "step_post_backward": ("TurboDensityStrategy", strategy_step_after),
-    "optimizer": ("SharedOptimizer", optimizer),
-    "render": ("sparse_rasterization", render),
-}
-
-
-@pytest.mark.parametrize("process_group", [2], indirect=True)
-@pytest.mark.parametrize("name", SWAPS)
-def test_several_processes_are_refused_by_name(process_group, name):
-    swap, use = SWAPS[name]
-    with pytest.raises(InputError, match=f"^{swap} works in one process, this process group has {process_group}: "):
-        use()
-
-
-@pytest.mark.parametrize("process_group", [1], indirect=True)
-def test_a_host_trains_in_a_process_group_of_one(process_group):
-    host = Host(TurboDensityStrategy(), SharedOptimizer(SparseAdam()), tells_errors=True)
-    losses = host.train(4)
+def test_a_host_trains_in_a_process_group_of_one():
+    with process_group(1):
+        losses = Host(TurboDensityStrategy(), SharedOptimizer(SparseAdam()), tells_errors=True).train(4)
     assert losses[-1] < losses[0]
 
 
-def test_a_group_that_forms_during_training_is_refused():
+def test_several_processes_are_refused_by_name():
+    """Where a swap is made, and where a group forms during training."""
     host = Host(TurboDensityStrategy(), SharedOptimizer(SparseAdam()))
     host.step(0)
-    distributed.init_process_group("fake", store=FakeStore(), rank=0, world_size=2)
-    try:
-        with pytest.raises(InputError, match="works in one process"):
-            host.step(1)
-        for name in host.splats:
-            host.splats[name].grad = torch.ones_like(host.splats[name])
-        with pytest.raises(InputError, match=r"^SharedOptimizer works in one process"):
-            for member in host.optimizers.values():
-                member.step()
-    finally:
-        distributed.destroy_process_group()
+    for value in host.splats.values():
+        value.grad = torch.ones_like(value)
+    given = (host.splats, host.optimizers, host.state, 1, host.info)
+    refused = {
+        "TurboDensityStrategy": [host.strategy.step_pre_backward, host.strategy.step_post_backward],
+        "SharedOptimizer": [
+            lambda *_: SharedOptimizer(SparseAdam())([{"params": host.splats["means"], "name": "means"}]),
+            lambda *_: [member.step() for member in host.optimizers.values()],
+        ],
+        "sparse_rasterization": [lambda *_: host.step(1)],
+    }
+    with process_group(2):
+        for swap, uses in refused.items():
+            for use in uses:
+                with pytest.raises(InputError, match=f"^{swap} works in one process, this process group has 2: "):
+                    use(*given)

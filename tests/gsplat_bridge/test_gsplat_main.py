@@ -4,7 +4,6 @@ import functools
 
 import pytest
 import torch
-from gsplat import DefaultStrategy
 from helpers.bridge_host import Host
 from helpers.gsplat_stand_ins import Scene
 
@@ -53,12 +52,3 @@ def test_a_row_update_takes_a_scene_along():
     apply_row_update(update, host.splats, host.optimizers, host.state, scene)
     assert scene.signal["tag"].tolist() == [5, 0, 7, 7, 39]
     assert_rows_follow(scene)
-
-
-def test_hooks_have_the_arguments_that_mains_trainer_gives():
-    """``step_post_backward(params=, optimizers=, state=, step=, info=, packed=, scene=)``, all by name."""
-    host = Host(TurboDensityStrategy(**SOON))
-    host.step(0)
-    common = {"params": host.splats, "optimizers": host.optimizers, "state": host.state, "step": 1}
-    host.strategy.step_post_backward(**common, info=host.info, packed=False, scene=None)
-    assert isinstance(host.strategy, DefaultStrategy)

@@ -1,7 +1,7 @@
 """What gsplat's DefaultStrategy takes from our `info` is what gsplat's own formulas give it at the same Gaussians.
 
-The other side is gsplat's torch reference of the projection, its kernels' rule for radii, and compositing written out
-here for autograd, pixel by pixel in float64.
+The other side is gsplat's torch code and compositing by autograd in float64 (`helpers.gsplat_torch`), and the rule for
+radii of gsplat's kernels.
 """
 
 from importlib import import_module
@@ -9,17 +9,19 @@ from importlib import import_module
 import pytest
 import torch
 from gsplat import DefaultStrategy
-from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats
+from helpers.gsplat_torch import gsplat_torch_render
 
 from turbogs_plugin.engine.render import dense_samples
-from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_rasterization
+from turbogs_plugin.gsplat_bridge import sparse_rasterization
 from turbogs_plugin.gsplat_bridge.gaussian_errors import screen_statistics
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
 
 sparse_rasterization_module = import_module("turbogs_plugin.gsplat_bridge.sparse_rasterization")
 """The package has the function under this name."""
 
-ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN, EXTENT_MAX = 1 / 255, 0.999, 1e-4, 3.33
+ALPHA_MIN, EXTENT_MAX = 1 / 255, 3.33
 
 
 def gsplat_radii(means2d, depths, conics, opacities):
@@ -35,43 +37,22 @@ def gsplat_radii(means2d, depths, conics, opacities):
 
 
 def gsplat_info(splats, cameras, pixels):
-    """`info` after the backward pass of a mean absolute difference."""
-    given = {name: value.detach().double() for name, value in arguments(splats, cameras).items() if name[0] not in "wh"}
-    viewmats, opacities = given["viewmats"], given["opacities"]
-    covariances, _ = _quat_scale_to_covar_preci(given["quats"], given["scales"], compute_preci=False)
+    """`info` after the backward pass of a mean absolute difference from pixels [P, 3] of whole images."""
+    gaussians = Gaussians(**{name: splats[name].detach().double() for name in PARAMETER_NAMES})
+    cameras, drawn = cameras.to(dtype=torch.float64), []
+    colors, _, _ = gsplat_torch_render(gaussians, cameras, dense_samples(cameras), sh_degree=1, drawn=drawn)
+    torch.nn.functional.l1_loss(colors, pixels.double()).backward()
+    covariances, _ = _quat_scale_to_covar_preci(gaussians.quats, gaussians.scales.exp(), compute_preci=False)
     _, means2d, depths, conics, _ = _fully_fused_projection(
-        given["means"], covariances, viewmats, given["Ks"], WIDTH, HEIGHT
+        gaussians.means, covariances, cameras.viewmats, cameras.Ks, WIDTH, HEIGHT
     )
-    opacities = opacities.expand(depths.shape)
-    radii = gsplat_radii(means2d, depths, conics, opacities)
-    directions = given["means"] - torch.inverse(viewmats)[:, None, :3, 3]
-    # View by view: gsplat 1.6 takes one set of coefficients.
-    colors = torch.stack([_spherical_harmonics(1, one_view, given["colors"]) for one_view in directions])
-    colors = (colors + 0.5).clamp(min=0)
-
-    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
-    centers = torch.stack([x, y], -1).reshape(-1, 1, 2) + 0.5  # [H * W, 1, 2]
-    per_pixel, total = [], 0.0
-    for view in range(len(viewmats)):
-        # One leaf of means for each pixel: its gradients are the terms of which means2d.grad and absgrad are sums.
-        leaf = means2d[view].expand(HEIGHT * WIDTH, -1, -1).clone().requires_grad_()  # [H * W, N, 2]
-        per_pixel.append(leaf)
-        order = depths[view].argsort()
-        dx, dy = (leaf - centers).unbind(-1)
-        a, b, c = conics[view].unbind(-1)
-        sigma = torch.where((radii[view] > 0).all(-1), 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy, 1e3)
-        alpha = opacities[view] * torch.exp(-sigma)
-        alpha = alpha.clamp(max=ALPHA_MAX) * (alpha >= ALPHA_MIN)
-        alpha = alpha[:, order]
-        behind = (1 - alpha).cumprod(-1)
-        alpha = alpha * (behind > TRANSMITTANCE_MIN)
-        weights = alpha * torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], -1)
-        image = weights @ colors[view, order]
-        total = total + (image - pixels[view].reshape(-1, 3)).abs().sum()
-    terms = torch.stack(torch.autograd.grad(total / pixels.numel(), per_pixel))  # [C, H * W, N, 2]
+    radii = gsplat_radii(means2d, depths, conics, torch.sigmoid(gaussians.opacities).expand(depths.shape))
     means2d = means2d.float().requires_grad_()
-    means2d.grad, means2d.absgrad = terms.sum(1).float(), terms.abs().sum(1).float()
-    sizes = {"width": WIDTH, "height": HEIGHT, "n_cameras": len(viewmats)}
+    means2d.grad, means2d.absgrad = torch.zeros_like(means2d), torch.zeros_like(means2d)
+    for view, one in enumerate(drawn):
+        means2d.grad[view, one.order] = one.distances.grad.sum(dim=0).float()
+        means2d.absgrad[view, one.order] = one.distances.grad.abs().sum(dim=0).float()
+    sizes = {"width": WIDTH, "height": HEIGHT, "n_cameras": len(cameras)}
     return {"means2d": means2d, "radii": radii, "gaussian_ids": None, **sizes}
 
 
@@ -84,10 +65,10 @@ def test_default_strategys_statistics_are_gsplats(views, absgrad):
         splats["means"][4:8, 2] = torch.tensor([-2.998, -2.995, -2.9, -4.0])  # at and behind the near plane
         splats["means"][8:12, 0] = torch.tensor([2.0, -2.0, 2.4, 6.0])  # at the edge of the image and past it
     samples = dense_samples(cameras)
-    pixels = torch.rand(views, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(2))
+    pixels = torch.rand(len(samples), 3, generator=torch.Generator().manual_seed(2))
     colors, _, ours = sparse_rasterization(**arguments(splats, cameras), samples=samples, sh_degree=1, absgrad=absgrad)
-    torch.nn.functional.l1_loss(colors, gather_pixels(pixels, samples)).backward()
-    theirs = gsplat_info(splats, cameras, pixels.double())
+    torch.nn.functional.l1_loss(colors, pixels).backward()
+    theirs = gsplat_info(splats, cameras, pixels)
 
     assert torch.equal(ours["radii"], theirs["radii"])
     assert 0 < (ours["radii"] > 0).all(-1).sum() < views * 60

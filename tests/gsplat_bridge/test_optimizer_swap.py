@@ -36,26 +36,11 @@ def set_gradients(splats, seed):
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_without_shares_of_the_loss_it_is_adam(rule):
-    ours, theirs, options = make_splats(), make_splats(), {"eps": 1e-3, "betas": (0.8, 0.95)}
-    members = members_of(ours, RULES[rule](), **options)
-    members["quats"].param_groups[0]["betas"] = [0.8, 0.95]  # a list, as JSON has it
-    adams = {
-        name: torch.optim.Adam([{"params": theirs[name], "lr": RATES[name]}], **options) for name in PARAMETER_NAMES
-    }
-    for seed in range(4):
-        set_gradients(ours, seed)
-        set_gradients(theirs, seed)
-        for optimizer in [*members.values(), *adams.values()]:
-            optimizer.step()
-    for name in PARAMETER_NAMES:
-        torch.testing.assert_close(ours[name], theirs[name], rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("rule", RULES)
-def test_new_rows_step_as_torchs_adam_lets_them(rule):
+def test_without_shares_of_the_loss_it_is_adam_for_new_rows_too(rule, capsys):
     """gsplat's operations give a new Gaussian moments of zero and leave the count: its correction is the run's."""
     ours, theirs = (Host(DefaultStrategy(**LATE), optimizer) for optimizer in (SharedOptimizer(RULES[rule]()), ADAM))
+    for optimizer in [*ours.optimizers.values(), *theirs.optimizers.values()]:
+        optimizer.param_groups[0].update(eps=1e-3, betas=[0.8, 0.95])  # a list, as JSON has it
     for seed in range(6):
         for host in (ours, theirs):
             set_gradients(host.splats, seed)
@@ -66,6 +51,7 @@ def test_new_rows_step_as_torchs_adam_lets_them(rule):
                     surgery(operation, host, torch.Generator().manual_seed(1))
     for name in PARAMETER_NAMES:
         torch.testing.assert_close(ours.splats[name], theirs.splats[name], rtol=1e-5, atol=1e-6)
+    assert capsys.readouterr().out.count("steps are Adam's") == (rule == "lm")
 
 
 def test_untouched_rows_stay():
@@ -112,14 +98,6 @@ def test_shares_of_the_loss_change_the_step():
         losses = host.train(6)
         assert losses[-1] < losses[0]
     assert not torch.allclose(plain.splats["means"], damped.splats["means"], atol=1e-5)
-
-
-def test_it_says_once_that_it_lacks_shares(capsys):
-    host = Host(DefaultStrategy(**LATE), SharedOptimizer(MomentLMOptimizer()))
-    host.train(3)
-    assert capsys.readouterr().out.count("steps are Adam's") == 1
-    Host(DefaultStrategy(**LATE), SharedOptimizer(SparseAdam())).train(2)
-    assert capsys.readouterr().out == ""
 
 
 def test_observe_alone_gives_shares_under_any_strategy(capsys):
@@ -273,28 +251,6 @@ def test_copies_of_members_go_on_by_themselves(rule, copied):
     assert all(torch.equal(splats[name], values[name]) for name in PARAMETER_NAMES)
 
 
-@pytest.mark.parametrize("option", [{"weight_decay": 0.5}, {"maximize": True}, {"amsgrad": True}])
-def test_options_of_a_group_that_it_does_not_know_are_refused(option):
-    (name, value), splats = *option.items(), make_splats()
-    members = members_of(splats, SparseAdam())
-    for member in members.values():
-        member.param_groups[0][name] = type(value)(0)  # as in the state of torch's Adam
-    members["quats"].param_groups[0].update(option)
-    set_gradients(splats, 0)
-    with pytest.raises(InputError, match=rf"the group of 'quats' has {name} = {value}, .*: leave it out"):
-        for member in members.values():
-            member.step()
-    assert all(torch.equal(splats[key], value) for key, value in make_splats().items())
-
-
-def test_a_second_group_is_refused():
-    members = members_of(make_splats(), SparseAdam())
-    more = {"params": [torch.nn.Parameter(torch.ones(3))], "name": "poses"}
-    with pytest.raises(InputError, match=r"optimizer of 'means' takes no second group: give .* 'poses' an optimizer"):
-        members["means"].add_param_group(more)
-    assert len(members["means"].param_groups) == 1
-
-
 def test_mistakes_are_named():
     splats = make_splats()
     members = members_of(splats, SparseAdam())
@@ -327,8 +283,6 @@ def test_mistakes_are_named():
             member.step()
 
     shared = SharedOptimizer(SparseAdam())
-    with pytest.raises(InputError, match=r"parameter 'means' is of torch.float16: make it float32 or float64"):
-        shared([{"params": torch.nn.Parameter(torch.zeros(4, 3).half()), "lr": 1e-3, "name": "means"}])
     with pytest.raises(InputError, match=r"got groups named \['features'\]"):
         shared([{"params": splats["means"], "lr": 1e-3, "name": "features"}])
     shared([{"params": splats["means"], "lr": 1e-3, "name": "means"}])
@@ -336,21 +290,15 @@ def test_mistakes_are_named():
         shared([{"params": splats["means"], "lr": 1e-3, "name": "means"}])
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "message"),
-    [("eps", 0.0, "eps = 0.0"), ("betas", (0.9, 1.5), "beta2 = 1.5"), ("betas", (1.0, 0.999), "beta1 = 1.0")],
-)
-def test_options_that_adam_cannot_use_are_refused_before_anything_moves(option, value, message):
+def test_options_that_adam_cannot_use_are_refused_before_anything_moves():
     splats = make_splats()
-    members = members_of(splats, SparseAdam(), **{option: value})
+    members = members_of(splats, SparseAdam(), betas=(0.9, 1.5))
     set_gradients(splats, 0)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match="beta2"):
         for member in members.values():
             member.step()
     assert all(torch.equal(splats[name], value) for name, value in make_splats().items())
     assert not any(member.state for member in members.values())
-    rule = members["means"].shared.optimizer
-    assert (rule.beta1, rule.beta2, rule.eps) == (SparseAdam.beta1, SparseAdam.beta2, SparseAdam.eps)
 
 
 def test_rows_removed_behind_its_back_are_refused():

@@ -35,13 +35,6 @@ def test_impossible_numbers_are_refused(arguments, name):
         sparse_budget(*arguments)
 
 
-def test_numbers_may_be_integers_of_numpy():
-    for given in ((np.int64(50), np.int32(8)), (np.int64(3), None)):
-        budget = sparse_budget(*given)
-        assert budget == sparse_budget(*(None if number is None else int(number) for number in given))
-        assert type(budget.views) is int  # torch's data loader refuses any other
-
-
 @dataclass
 class Photos:
     """A data set as gsplat's: items by number, no iteration."""

@@ -16,7 +16,6 @@ from gsplat import DefaultStrategy
 from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
 
 from turbogs_plugin.engine.render import dense_samples
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_rasterization
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
@@ -156,16 +155,3 @@ def test_both_layouts_take_the_same_steps():
         results.append({name: value.detach().reshape(splats[name].shape) for name, value in params.items()})
     for name in results[0]:
         torch.testing.assert_close(results[1][name], results[0][name], rtol=0, atol=0)
-
-
-@pytest.mark.parametrize(("name", "shape"), [("opacities", (40, 2)), ("sh0", (40, 1)), ("opacities", (39, 1))])
-def test_other_layouts_are_refused(name, shape):
-    splats = dict(make_splats().items())
-    splats[name] = torch.nn.Parameter(torch.zeros(shape))
-    shared = SharedOptimizer(MomentLMOptimizer())
-    members = [shared([{"params": [value], "lr": 0.01, "name": key}]) for key, value in splats.items()]
-    for value in splats.values():
-        value.grad = torch.ones_like(value)
-    with pytest.raises(InputError, match=f"parameter '{name}' has shape"):
-        for member in members:
-            member.step()

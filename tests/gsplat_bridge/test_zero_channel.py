@@ -1,9 +1,10 @@
-"""The zero channel's arithmetic, over a compositor in plain torch that stands for gsplat's, which needs a GPU."""
+"""The zero channel's arithmetic, over a compositor in plain torch that stands for gsplat's, which needs a GPU; and
+options of gsplat's trainer that change a render or its errors."""
 
 import gsplat
 import pytest
 import torch
-from helpers.bridge_host import make_splats
+from helpers.bridge_host import WIDTH, Host, make_splats
 from helpers.gsplat_stand_ins import CAMERAS, COUNT, rendered_info, stand_in, stock_info
 
 from turbogs_plugin.errors import InputError
@@ -52,31 +53,69 @@ def test_optimizer_and_strategy_share_one_further_pass(rendered, monkeypatch):
     assert state["driven_by"] == "error"
 
 
-def test_errors_that_come_too_late_for_our_rasterizer_are_refused(rendered):
+def stock(monkeypatch) -> dict:
+    """`info` of gsplat's own rasterizer with errors in it, after backward; its compositor is a stand-in."""
+    info, camera_of = stock_info(rendered_info(), packed=False)
+    monkeypatch.setattr(gsplat, "rasterize_to_pixels", stand_in(camera_of))
+    return info
+
+
+def densified(info: dict) -> None:
+    """A refinement by this `info`, which changes the Gaussians."""
+    host = Host(TurboDensityStrategy(refine_start_iter=0, refine_every=1, grow_grad2d=1e-6))
+    host.strategy.step_post_backward(host.splats, host.optimizers, host.state, 1, info)
+    assert host.state["driven_by"] == "error" and len(host.splats["means"]) > 40
+
+
+def test_weights_are_of_the_compensated_opacities_of_an_antialiased_render(monkeypatch):
+    plain, faint = stock(monkeypatch), stock(monkeypatch)
+    faint["opacities"] = 0.25 * faint["opacities"].detach()
+    plain_sum, faint_sum = (iteration_stats(info, COUNT)[0].weight_sums.sum() for info in (plain, faint))
+    assert 0 < faint_sum < 0.6 * plain_sum
+    densified(faint)
+
+
+@pytest.mark.parametrize("option", ["bilateral_grid", "random_bkgd", "RGB+D"])
+def test_a_prediction_that_the_host_changed_still_drives_density(monkeypatch, option):
+    info = stock(monkeypatch)
+    seen = info["prediction"]
+    with_depth = torch.cat([seen, seen[..., :1]], dim=-1)
+    if option == "RGB+D":
+        with pytest.raises(InputError, match=r"expected both \[C, H, W, 3\]"):
+            densified({**info, "prediction": with_depth})
+    changed = {
+        "bilateral_grid": seen @ torch.diag(torch.tensor([1.1, 0.9, 1.0])),
+        "random_bkgd": seen + torch.tensor([0.1, 0.2, 0.3]),
+        "RGB+D": with_depth[..., :3],
+    }
+    densified({**info, "prediction": changed[option]})
+
+
+def test_errors_of_masked_pixels_count_unless_the_photo_is_black_there_too(monkeypatch):
+    """gsplat's trainer leaves the render black where it is masked."""
+    counts = (torch.arange(WIDTH) < WIDTH // 3)[:, None]  # [W, 1] True where a pixel counts
+    whole, black, expected = (stock(monkeypatch) for _ in range(3))
+    for info in (whole, black):
+        info["prediction"] = info["prediction"] * counts
+    black["ground_truth"] = black["ground_truth"] * counts
+    errors = counts * (expected["prediction"] - expected["ground_truth"])
+    expected |= {"prediction": errors, "ground_truth": torch.zeros_like(errors)}
+    sums = [iteration_stats(info, COUNT)[0].error_sums for info in (whole, black, expected)]
+    torch.testing.assert_close(sums[1], sums[2])
+    assert sums[0].sum() > 1.5 * sums[1].sum() > 0
+    densified(black)
+
+
+def test_info_that_does_not_fit_is_refused(rendered, monkeypatch):
+    """A render with the unscented transform leaves no gradient on the screen; its weights are not splats'."""
+    host, info = Host(TurboDensityStrategy()), stock(monkeypatch)
+    with pytest.raises(InputError, match="takes no gradient, as from a render with with_ut"):
+        host.strategy.step_pre_backward(host.splats, host.optimizers, host.state, 0, {"means2d": torch.zeros(1, 40, 2)})
+    with pytest.raises(InputError, match=r"takes no gradient, as from a render with with_ut or with_eval3d"):
+        loss_shares({**info, "means2d": info["means2d"].detach()}, COUNT)
+    small = torch.zeros(CAMERAS, 5, 5, 3)
+    with pytest.raises(InputError, match=r"of shape \(\d, 5, 5, 3\): expected \(\d, 24, 40, 3\), what gsplat"):
+        iteration_stats({**info, "prediction": small, "ground_truth": small}, COUNT)
     late = {key: value for key, value in rendered.items() if key not in ("gaussian_stats", "loss_shares")}
     with pytest.raises(InputError, match="put them in before backward"):
         iteration_stats(late, COUNT)
-
-
-def test_errors_of_other_images_are_refused(rendered):
-    info, _ = stock_info(rendered, packed=False)
-    info.update(prediction=torch.zeros(CAMERAS, 5, 5, 3), ground_truth=torch.zeros(CAMERAS, 5, 5, 3))
-    with pytest.raises(InputError, match=r"of shape \(\d, 5, 5, 3\): expected \(\d, 24, 40, 3\), what gsplat"):
-        iteration_stats(info, COUNT)
-
-
-def test_info_of_several_processes_cameras_is_refused(rendered, monkeypatch):
-    """gsplat's distributed mode: the projection is of all processes' cameras, the tiles are of this one's."""
-    info, camera_of = stock_info(rendered, packed=False)
-    monkeypatch.setattr(gsplat, "rasterize_to_pixels", stand_in(camera_of))
-    info |= {key: info[key][:1] for key in ("isect_offsets", "prediction", "ground_truth")}
-    with pytest.raises(InputError, match=r"distributed=True, means2d of 2 cameras and tiles of 1: .*TurboDensityStrat"):
-        iteration_stats(info, COUNT)
-
-
-def test_info_without_a_gradient_on_the_screen_is_refused(rendered):
-    """A render with the unscented transform gives such `info`; its weights are not splats'."""
-    info, _ = stock_info(rendered, packed=False)
-    info["means2d"] = info["means2d"].detach()
-    with pytest.raises(InputError, match=r"takes no gradient, as from a render with with_ut or with_eval3d"):
-        loss_shares(info, COUNT)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,15 +10,12 @@ from typing import Any
 from turbogs_plugin.errors import InputError
 
 REFERENCES, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
-KERNEL_COUNTS = os.access(REFERENCES, os.W_OK)
-"""Linux tells the peak of a process since it was asked to forget the one before. `tracemalloc` doubles a test's time,
-and sees no memory of torch or of decoders."""
+"""Linux tells the peak of a process since it was asked to forget the one before."""
 
 
 def outcome_within(memory: int, function: Callable, *arguments: Any) -> Any:
-    """The result of a call, or the InputError it ended in; anything else fails. `memory`: in bytes, of this process
-    where the kernel tells, else of Python and numpy. A call that takes more is made again: it may be the first to load
-    a library."""
+    """The result of a call, or the InputError it ended in; anything else fails. `memory`: bytes of this process. A call
+    that takes more is made again: it may be the first to load a library."""
     for _ in range(2):
         result, peak = _outcome(function, arguments)
         if peak < memory:
@@ -30,31 +25,14 @@ def outcome_within(memory: int, function: Callable, *arguments: Any) -> Any:
 
 def _outcome(function: Callable, arguments: tuple) -> tuple[Any, int]:
     """What came of a call, and the bytes that it took at most."""
-    before = _begin()
+    REFERENCES.write_text("5")
+    before = _highest()
     try:
         result = function(*arguments)
     except InputError as error:
         assert "\n" not in str(error) and len(str(error)) < 2000
         result = error
-    finally:
-        peak = _end()
-    return result, peak - before
-
-
-def _begin() -> int:
-    if not KERNEL_COUNTS:
-        tracemalloc.start()
-        return 0
-    REFERENCES.write_text("5")
-    return _highest()
-
-
-def _end() -> int:
-    if KERNEL_COUNTS:
-        return _highest()
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    return peak
+    return result, _highest() - before
 
 
 def _highest() -> int:

@@ -152,20 +152,3 @@ def surgery(operation: str, host: Host, generator: torch.Generator) -> None:
         reset_opa(**common, value=0.1)
     else:
         {"duplicate": duplicate, "split": split, "remove": remove}[operation](**common, mask=mask)
-
-
-def assert_rows_match_after(host: Host, operations: list[str], seed: int) -> None:
-    """The host's rows match after each of these operations, which begin after its first step; "step" is an iteration.
-
-    A step at the end shows that it still trains.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    host.step(0)
-    for number, operation in enumerate(operations, start=1):
-        if operation == "step":
-            host.step(number)
-        else:
-            surgery(operation, host, generator)
-        host.assert_rows_match()
-    host.step(9)
-    host.assert_rows_match()

@@ -4,6 +4,7 @@ from typing import Any
 
 import torch
 from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats
+from helpers.gsplat_torch import weights_of
 
 from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.gsplat_bridge import sparse_rasterization
@@ -14,19 +15,9 @@ COUNT, CAMERAS = 40, 2
 def composite(means2d, conics, colors, opacities, order):
     """[H, W, D] one image: splats [S, ...] drawn in this order, as gsplat defines it."""
     y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
-    image = torch.zeros(HEIGHT, WIDTH, colors.shape[-1])
-    through = torch.ones(HEIGHT, WIDTH)
-    ended = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    for splat in order.tolist():
-        dx, dy = means2d[splat, 0] - x, means2d[splat, 1] - y
-        a, b, c = conics[splat]
-        alpha = (opacities[splat] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).clamp(max=0.999)
-        alpha = torch.where(alpha < 1 / 255, 0.0, alpha)
-        ended = ended | (through * (1 - alpha) <= 1e-4)
-        alpha = torch.where(ended, 0.0, alpha)
-        image = image + (through * alpha)[..., None] * colors[splat]
-        through = through * (1 - alpha)
-    return image
+    distances = means2d[order] - torch.stack([x, y], dim=-1).reshape(-1, 1, 2)  # [H * W, S, 2]
+    weights, _ = weights_of(distances, conics[order], opacities[order])
+    return (weights @ colors[order]).reshape(HEIGHT, WIDTH, -1)
 
 
 def stand_in(camera_of):

@@ -3,6 +3,8 @@ compositing front to back as gsplat documents it. Slow, and no line is shared wi
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 from torch import Tensor
@@ -11,14 +13,37 @@ from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 
+@dataclass
+class Drawn:
+    """What was drawn of one view.
+
+    Args:
+        order: [S] the Gaussians in the order of drawing. slots: [n] the samples of the view.
+        distances: [n, S, 2] of the Gaussians' means from the pixels' centres; their gradients are the terms of the
+            gradient on the screen.
+        weights, sigmas: [n, S], see `weights_of`.
+    """
+
+    order: Tensor
+    slots: Tensor
+    distances: Tensor
+    weights: Tensor
+    sigmas: Tensor
+
+
 def gsplat_torch_render(
     gaussians: Gaussians,
     cameras: Cameras,
     samples: PixelSamples,
     sh_degree: int | None = None,
     settings: RasterSettings = DEFAULT_SETTINGS,
+    drawn: list[Drawn] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours [P, 3], alphas [P] and expected depths [P] at the samples; zero in empty slots."""
+    """Colours [P, 3], alphas [P] and expected depths [P] at the samples; zero in empty slots.
+
+    Args:
+        drawn: list that takes what was drawn of each view; the distances there keep their gradients.
+    """
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     covars, _ = _quat_scale_to_covar_preci(gaussians.quats, gaussians.scales.exp(), True, False)
     coefficients = torch.cat([gaussians.sh0, gaussians.shN], dim=1)
@@ -45,16 +70,32 @@ def gsplat_torch_render(
         order = depths.argsort(stable=True)
         order = order[(radii > 0).all(dim=-1)[order]]
         slots = torch.nonzero((views == view) & samples.filled).squeeze(-1)
-        dx, dy = (means2d[order] - places[slots][:, None]).unbind(dim=-1)  # [S, n]
-        a, b, c = conics[order].unbind(dim=-1)
-        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-        alphas = (opacities[order] * torch.exp(-sigma)).clamp(max=settings.alpha_max)
-        alphas = torch.where((sigma >= 0) & (alphas >= settings.alpha_min), alphas, 0)
-        going = (1 - alphas).cumprod(dim=1) > settings.transmittance_min
-        alphas = torch.where(going, alphas, 0)
-        before = torch.cat([torch.ones_like(alphas[:, :1]), (1 - alphas).cumprod(dim=1)[:, :-1]], dim=1)
-        weights = alphas * before  # [S, n]
+        distances = means2d[order] - places[slots][:, None]  # [n, S, 2]
+        if drawn is not None:
+            distances.requires_grad_()
+        weights, sigmas = weights_of(distances, conics[order], opacities[order], settings)
+        if drawn is not None:
+            drawn.append(Drawn(order, slots, distances, weights.detach(), sigmas.detach()))
         values = torch.cat([colors[order], depths[order, None], torch.ones_like(depths[order, None])], dim=1)
         result = result.index_add(0, slots, weights @ values)
     alphas = result[:, 4]
     return result[:, :3], alphas, result[:, 3] / alphas.clamp(min=1e-10)
+
+
+def weights_of(
+    distances: Tensor, conics: Tensor, opacities: Tensor, settings: RasterSettings = DEFAULT_SETTINGS
+) -> tuple[Tensor, Tensor]:
+    """[n, S] the weight of each Gaussian in each pixel, and half its squared Mahalanobis distance from there.
+
+    Args:
+        distances: [n, S, 2] of the means, in the order of drawing, from the pixels' centres.
+        conics: [S, 3]. opacities: [S] after sigmoid.
+    """
+    dx, dy = distances.unbind(dim=-1)
+    a, b, c = conics.unbind(dim=-1)
+    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alphas = (opacities * torch.exp(-sigma)).clamp(max=settings.alpha_max)
+    alphas = torch.where((sigma >= 0) & (alphas >= settings.alpha_min), alphas, 0)
+    alphas = torch.where((1 - alphas).cumprod(dim=1) > settings.transmittance_min, alphas, 0)
+    before = torch.cat([torch.ones_like(alphas[:, :1]), (1 - alphas).cumprod(dim=1)[:, :-1]], dim=1)
+    return alphas * before, sigma

@@ -7,6 +7,7 @@ from dataclasses import fields
 import torch
 from torch import Tensor
 
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.types import GaussianGradients, Gaussians, GaussianStats, Step
 
 STEP = Step(iteration=100, total=5000, refine_until=3500, seed=7, scene_extent=2.0)
@@ -95,6 +96,15 @@ def fill(target: GaussianStats, source: GaussianStats) -> None:
     """Write statistics into a controller's window."""
     for field in fields(source):
         getattr(target, field.name).copy_(getattr(source, field.name))
+
+
+def controlled(gaussians: Gaussians, stats: GaussianStats | None = None, **config) -> ErrorDrivenDensity:
+    """A controller of these Gaussians, with these statistics in its window."""
+    density = ErrorDrivenDensity(**config)
+    density.setup(gaussians)
+    if stats is not None:
+        fill(density.stats, stats)
+    return density
 
 
 def all_finite(gaussians: Gaussians) -> bool:

@@ -69,7 +69,7 @@ def ended(processes: list[Any], seconds: float = 120.0) -> list[int]:
     late = [process for process in processes if process.is_alive()]
     for process in late:
         process.kill()
-        process.join()
+        process.join(10.0)
     assert not late, "processes wait for ever"
     return [process.exitcode for process in processes]
 

@@ -1,16 +1,15 @@
-"""Small scenes and a renderer of nested loops that the tests of the rasterizers share."""
+"""Small scenes that the tests of the rasterizers share."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.render import dense_samples
-from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.tiles import compact, pixel_table
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
@@ -84,107 +83,6 @@ def thin_out(samples: PixelSamples, rate: float, seed: int = 0, empty_slots: int
         torch.tensor([0, *np.cumsum(counts)], dtype=torch.int32),
         origin=samples.origin,
     )
-
-
-@dataclass
-class LoopRender:
-    """What the loops compute: colors [P, 3], alphas [P], depths [P] (expected), and, by Gaussian and view [K, N], the
-    sums of e * w, D * w and w. `margin`: the least distance of any decision from its threshold."""
-
-    colors: np.ndarray
-    alphas: np.ndarray
-    depths: np.ndarray
-    error_sums: np.ndarray
-    distance_sums: np.ndarray
-    weight_sums: np.ndarray
-    margin: float
-
-
-def _rotation(quaternion: np.ndarray) -> np.ndarray:
-    """By the axis-angle form of Rodrigues, so that no line is shared with what is tested."""
-    quaternion = quaternion / np.linalg.norm(quaternion)
-    half = math.acos(np.clip(quaternion[0], -1, 1))
-    axis = quaternion[1:]
-    if np.linalg.norm(axis) == 0:
-        return np.eye(3)
-    axis = axis / np.linalg.norm(axis)
-    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + math.sin(2 * half) * skew + (1 - math.cos(2 * half)) * skew @ skew
-
-
-def loop_render(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    samples: PixelSamples,
-    colors: np.ndarray,
-    pixel_errors: np.ndarray,
-    settings: RasterSettings = DEFAULT_SETTINGS,
-) -> LoopRender:
-    """Render pixel by pixel, splat by splat, in float64, straight from the definitions.
-
-    Args:
-        colors: [K, N, 3] colours of the Gaussians in each view.
-        pixel_errors: [P].
-    """
-    values = {name: value.detach().double().numpy() for name, value in gaussians.items()}
-    count, views = len(gaussians), len(cameras)
-    viewmats, intrinsics = cameras.viewmats.double().numpy(), cameras.Ks.double().numpy()
-    opacities = 1 / (1 + np.exp(-values["opacities"]))
-    projected = []
-    margin = math.inf
-    for view in range(views):
-        rotation, translation = viewmats[view, :3, :3], viewmats[view, :3, 3]
-        matrix, (width, height) = intrinsics[view], cameras.sizes[view]
-        for index in range(count):
-            point = rotation @ values["means"][index] + translation
-            if not settings.near_plane <= point[2] <= settings.far_plane:
-                continue
-            turned = _rotation(values["quats"][index]) * np.exp(values["scales"][index])
-            world = turned @ turned.T
-            focal, center, size = matrix[[0, 1], [0, 1]], matrix[[0, 1], [2, 2]], np.array([width, height])
-            low, high = -(center + 0.15 * size) / focal, (1.15 * size - center) / focal
-            slope = np.minimum(np.maximum(point[:2] / point[2], low), high)
-            jacobian = np.zeros((2, 3))
-            jacobian[0, 0], jacobian[1, 1] = focal / point[2]
-            jacobian[:, 2] = -focal * slope / point[2]
-            covariance = jacobian @ rotation @ world @ rotation.T @ jacobian.T + settings.eps2d * np.eye(2)
-            mean = focal * point[:2] / point[2] + center
-            projected.append((view, point[2], index, mean, np.linalg.inv(covariance)))
-    projected.sort(key=lambda splat: splat[:3])
-
-    pixels, slot_views = samples.coordinates().numpy(), samples.view_of_slot().numpy()
-    filled = samples.filled.numpy()
-    result = LoopRender(
-        np.zeros((len(samples), 3)), np.zeros(len(samples)), np.zeros(len(samples)),
-        np.zeros((views, count)), np.zeros((views, count)), np.zeros((views, count)), math.inf,
-    )  # fmt: skip
-    for slot in np.flatnonzero(filled):
-        transmittance, depth_sum = 1.0, 0.0
-        for view, depth, index, mean, precision in projected:
-            if view != slot_views[slot]:
-                continue
-            offset = mean - (pixels[slot] + 0.5)
-            sigma = 0.5 * offset @ precision @ offset
-            raw = opacities[index] * math.exp(-sigma)
-            alpha = min(settings.alpha_max, raw)
-            margin = min(margin, abs(raw - settings.alpha_min), abs(raw - settings.alpha_max))
-            if alpha < settings.alpha_min:
-                continue
-            after = transmittance * (1 - alpha)
-            margin = min(margin, abs(after - settings.transmittance_min))
-            if after <= settings.transmittance_min:
-                break
-            weight = transmittance * alpha
-            result.colors[slot] += weight * colors[view, index]
-            result.alphas[slot] += weight
-            depth_sum += weight * depth
-            result.error_sums[view, index] += pixel_errors[slot] * weight
-            result.distance_sums[view, index] += math.sqrt(2 * sigma) * weight
-            result.weight_sums[view, index] += weight
-            transmittance = after
-        result.depths[slot] = depth_sum / max(result.alphas[slot], 1e-10)
-    result.margin = margin
-    return result
 
 
 def stacked_splats(z: Tensor) -> tuple[Gaussians, Cameras, PixelSamples]:

@@ -1,5 +1,7 @@
 """Error maps and steps for tests of pixel samplers."""
 
+import itertools
+
 import numpy as np
 import torch
 
@@ -32,3 +34,15 @@ def pixels_by_tile(samples):
         tile: [pixel for pixel in ids[begin:end] if pixel >= 0]
         for tile, begin, end in zip(samples.tile_ids.tolist(), offsets[:-1], offsets[1:], strict=True)
     }
+
+
+def successive(weights, count, left):
+    """{frozenset: probability} of `count` draws without replacement from `left`, by enumeration."""
+    sets = {}
+    for order in itertools.permutations(sorted(left), min(count, len(left))):
+        total, probability = sum(weights[i] for i in left), 1.0
+        for index in order:
+            probability *= weights[index] / total
+            total -= weights[index]
+        sets[frozenset(order)] = sets.get(frozenset(order), 0.0) + probability
+    return sets

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import torch
-from helpers.optimizers import fill, make_gaussians
+from helpers.optimizers import controlled, make_gaussians
 
-from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.types import Gaussians, GaussianStats, RowUpdate, Step
 
 SQUARES = {
@@ -54,10 +53,7 @@ def small_model(count: int) -> Gaussians:
 
 def event(gaussians: Gaussians, stats: GaussianStats, step: Step = EVENT, **settings) -> RowUpdate | None:
     """What an event of density control by squares changes after this window."""
-    density = ErrorDrivenDensity(**(SQUARES | settings))
-    density.setup(gaussians)
-    fill(density.stats, stats)
-    return density.update(gaussians, step)
+    return controlled(gaussians, stats, **(SQUARES | settings)).update(gaussians, step)
 
 
 def grown(update: RowUpdate) -> set[int]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy.ndimage import map_coordinates
 
 SIZE = (320, 240)
 FOCAL = 300.0
@@ -50,7 +51,7 @@ def _render(place: tuple[float, float, float], seed: int) -> Image.Image:
     for axis in range(3):
         texture = _texture(seed + axis)
         places = np.delete(points, axis, axis=-1)[plane == axis] * (len(texture) / EXTENT)
-        values[plane == axis] = _bilinear(texture, places)
+        values[plane == axis] = map_coordinates(texture, places.T, order=1, mode="nearest")
     gray = np.clip(values, 0, 255).astype(np.uint8)
     return Image.fromarray(np.stack([gray, gray, 255 - gray // 2], axis=-1))
 
@@ -73,13 +74,3 @@ def _texture(seed: int, size: int = 512) -> np.ndarray:
         noise = Image.fromarray(generator.standard_normal((cells, cells)).astype(np.float32))
         texture += weight * np.asarray(noise.resize((size, size), Image.Resampling.BICUBIC))
     return texture + 128.0
-
-
-def _bilinear(texture: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """[N] values at [N, 2] places in cells; beyond the edge, the edge."""
-    places = np.clip(places, 0, len(texture) - 1.001)
-    first = places.astype(np.int64)
-    (u, v), (i, j) = (places - first).T, first.T
-    return (texture[i, j] * (1 - u) + texture[i + 1, j] * u) * (1 - v) + (
-        texture[i, j + 1] * (1 - u) + texture[i + 1, j + 1] * u
-    ) * v

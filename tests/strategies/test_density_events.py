@@ -76,10 +76,10 @@ def test_events_are_where_it_says(name):
             fill(stats, random_stats(COUNT, seed=iteration))
         hidden = stats is not None and not due and "statistics" not in density.watched
         if hidden:
-            density._stats = Untouchable()
+            density.stats = Untouchable()
         update = density.update(given, step)
-        if hidden and density._stats is not None:
-            density._stats = stats
+        if hidden and density.stats is not None:
+            density.stats = stats
         said += [iteration] if due else []
         changed += [iteration] if update is not None else []
         if update is not None:

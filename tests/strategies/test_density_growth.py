@@ -6,11 +6,11 @@ import math
 
 import pytest
 import torch
-from helpers.optimizers import busy_stats, fill, make_gaussians, random_stats
+from helpers.optimizers import controlled, make_gaussians, random_stats
+from helpers.squares import grown, window
 
-from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.growth import drawn_by_squares
-from turbogs_plugin.types import GaussianStats, Step
+from turbogs_plugin.types import Step
 
 COUNT = 40
 FULL = Step(1200, 3500, 3500, seed=3, scene_extent=2.0)  # no final pruning follows
@@ -25,28 +25,9 @@ GROWS = {
 """All that is seen may grow, and nothing is pruned but by the order."""
 
 
-def controlled(gaussians, stats: GaussianStats, **config) -> ErrorDrivenDensity:
-    density = ErrorDrivenDensity(**config)
-    density.setup(gaussians)
-    fill(density.stats, stats)
-    return density
-
-
-def grown(update) -> set[int]:
-    """Rows that the event cloned or split."""
-    sources = update.source.tolist()
-    return {row for row in sources if sources.count(row) > 1}
-
-
-def squares_only(squares: list[float]) -> GaussianStats:
-    stats = busy_stats(len(squares))
-    stats.square_sums[:] = torch.tensor(squares)
-    return stats
-
-
 def first_drawn(squares: list[float], draws: int) -> list[float]:
     """Share of draws in which each row comes first."""
-    stats = squares_only(squares)
+    stats = window(squares)
     steps = (Step(100 * i, 10**9, 10**9, seed=0) for i in range(draws))
     first = [int(drawn_by_squares(stats, step).argmax()) for step in steps]
     return [first.count(row) / draws for row in range(len(squares))]

@@ -110,17 +110,3 @@ def test_a_resumed_window_goes_on_exactly(gaussians):
     actual = run_batches(second, gaussians, [OFTEN, OFTEN], first=3)[-1]
     assert torch.equal(actual.source, expected.source)
     assert torch.equal(actual.values["means"], expected.values["means"])
-
-
-def test_statistics_end_with_the_last_event_and_begin_again_in_a_run_that_becomes_longer(gaussians):
-    """A time budget makes a run longer that finds iterations cheaper than it thought."""
-    density = density_of(gaussians, refine_every=50)
-    assert density.update(gaussians, Step(801, 1000, 500)) is None
-    assert density.stats is None
-    assert density.update(gaussians, Step(802, 1000, 500)) is None
-    assert density.stats is None
-    assert density.update(gaussians, Step(803, 1200, 500)) is None
-    add_batch(density, ONCE)
-    assert density.update(gaussians, Step(804, 1200, 500)) is None
-    update = density.update(gaussians, Step(1100, 1200, 500))
-    assert update.num_pruned == 2 and update.source.tolist() == list(range(2, COUNT))

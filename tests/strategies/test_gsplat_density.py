@@ -11,7 +11,6 @@ from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 from helpers.optimizers import make_gaussians
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
 from turbogs_plugin.types import RowUpdate, Step
 
@@ -118,21 +117,3 @@ def test_a_refinement_starts_a_new_window_and_a_reset_does_not(refine_every, kep
     density.apply(update)
     assert update.source.tolist() == [9, 8, 7, 6, 5, 3, 2, 1, 0]
     assert torch.equal(density.stats.view_counts, update.source.float() if kept else torch.zeros(9))
-
-
-def test_nothing_to_do_and_the_end():
-    gaussians = make_gaussians(10, dtype=torch.float32)
-    density = GsplatDefaultDensity()
-    density.setup(gaussians)
-    for iteration in (0, 1, 550, 600):
-        assert density.update(gaussians, Step(iteration, 1000, 800)) is None
-    assert density.stats is not None
-    assert density.update(gaussians, Step(800, 1000, 800)) is None
-    assert density.stats is None
-    assert density.update(gaussians, Step(900, 1000, 800)) is None
-
-
-@pytest.mark.parametrize("values", [{"opacity_reset": "never"}, {"refine_every": 0}, {"refine_start_iter": -1}])
-def test_refuses(values):
-    with pytest.raises(InputError, match=next(iter(values))):
-        GsplatDefaultDensity(**values)

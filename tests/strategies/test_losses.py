@@ -8,10 +8,8 @@ import torch
 
 from turbogs_plugin.engine.reference.losses import TileGroups, window_similarity
 from turbogs_plugin.engine.rules import LossTerms
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.losses import EPSILON, CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.tiles import pixel_table
-from turbogs_plugin.train.metrics import ssim
 from turbogs_plugin.types import PixelSamples
 
 EVERY = [
@@ -47,7 +45,7 @@ def make_samples(counts, empty=(), weights=None):
     )
 
 
-def random_case(seed=0, counts=(5, 9, 1, 26, 3), empty=(1, 0, 0, 4, 2), weighted=False, dtype=torch.float64):
+def random_case(seed=0, counts=(5, 9, 1, 12, 3), empty=(1, 0, 0, 4, 2), weighted=False, dtype=torch.float64):
     generator = torch.Generator().manual_seed(seed)
     slots = sum(counts)
     weights = torch.rand(slots, generator=generator) + 0.2 if weighted else None
@@ -154,32 +152,6 @@ def test_value_and_gradient_are_the_equations(loss, weighted):
     assert np.abs(numeric).max() > 1e-3
 
 
-@pytest.mark.parametrize("origin", [(0, 0), (5, 11)])
-def test_windows_within_a_tile_are_those_of_the_evaluation(origin):
-    """Six by six pixels of a tile have their whole window in it."""
-    generator = torch.Generator().manual_seed(1)
-    photo, image = torch.rand(2, 32, 40, 3, generator=generator, dtype=torch.float64)
-    table = pixel_table(np.array([[40, 32]]), "cpu", origin)  # [T, 256]
-    tile = int((table >= 0).all(dim=1).nonzero()[0])
-    ids = table[tile]
-    samples = PixelSamples(
-        (0,),
-        np.array([[40, 32]]),
-        ids,
-        torch.tensor([tile], dtype=torch.int32),
-        torch.tensor([0, 256], dtype=torch.int32),
-        origin=origin,
-    )
-    colors, targets = image.view(-1, 3)[ids.long()], photo.view(-1, 3)[ids.long()]
-    found, _ = window_similarity(colors, targets, samples, TileGroups(samples, torch.ones(256, dtype=torch.float64)))
-    inside = (samples.coordinates() + torch.tensor(origin)) % 16
-    whole = ((inside >= 5) & (inside <= 10)).all(dim=1)
-    mask = torch.zeros(32 * 40, dtype=torch.bool)
-    mask[ids[whole].long()] = True
-    assert whole.sum() == 36
-    assert found[whole].mean().item() == pytest.approx(ssim(image, photo, mask.view(32, 40)).item(), rel=1e-9)
-
-
 def test_ssim_has_no_balance():
     with pytest.raises(ValueError, match="ssim has no balance"):
         LossTerms(1e-3, structure="ssim", structure_weight=0.2, balance=True)
@@ -212,40 +184,12 @@ def test_empty_slots_have_no_part(loss):
     assert result.loss == again.loss
 
 
-@pytest.mark.parametrize("loss", EVERY, ids=repr)
-def test_no_tile_is_no_loss(loss):
-    """Masks that hide all of a batch leave no tile."""
-    samples = make_samples([4])
-    nothing = torch.zeros(0, dtype=torch.int32)
-    samples = PixelSamples(samples.view_ids, samples.sizes, nothing, nothing, torch.zeros(1, dtype=torch.int32))
-    result = loss(torch.zeros(0, 3), torch.zeros(0, 3), samples)
-    assert result.loss == 0 and result.color_gradients.shape == (0, 3) and len(result.pixel_errors) == 0
-
-
 def test_pixel_errors_are_l1_norms():
     colors, targets, samples = random_case()
     result = CharbonnierNccLoss()(colors, targets, samples)
     expected = torch.where(samples.filled, (colors - targets).abs().sum(dim=1), 0.0)
     assert result.pixel_errors.dtype == torch.float32
     assert torch.allclose(result.pixel_errors, expected.float(), rtol=1e-6)
-
-
-@pytest.mark.parametrize("structure", ["ncc", "printed_ncc"])
-def test_a_step_against_the_gradient_raises_the_correlation(structure):
-    """The appendix's minus would lower it."""
-    generator = torch.Generator().manual_seed(4)
-    samples = make_samples([40])
-    targets = torch.rand(40, 3, generator=generator, dtype=torch.float64)
-    colors = torch.rand(40, 3, generator=generator, dtype=torch.float64)
-    l1_only = CharbonnierLoss()(colors, targets, samples).color_gradients
-    loss = CharbonnierNccLoss(ncc_weight=1.0, structure=structure)
-    structure_part = loss(colors, targets, samples).color_gradients - l1_only
-
-    def correlations(values):
-        return np.array([np.corrcoef(values[:, c], targets[:, c])[0, 1] for c in range(3)])
-
-    assert (correlations(colors - structure_part) > correlations(colors) + 1e-4).all()
-    assert (correlations(colors + structure_part) < correlations(colors) - 1e-4).all()
 
 
 def test_printed_ncc_is_the_appendix():
@@ -277,7 +221,7 @@ def test_printed_ncc_is_the_appendix():
 
 
 def test_a_flat_tile_scores_zero_as_printed_and_one_with_the_floor():
-    colors, targets = extreme_tiles()["truth constant"]
+    colors, targets = torch.rand(30, 3, generator=torch.Generator().manual_seed(6)), torch.full((30, 3), 0.3)
     plain = CharbonnierLoss()(colors, targets, make_samples([30]))
     printed = CharbonnierNccLoss(ncc_weight=1.0, structure="printed_ncc")(colors, targets, make_samples([30]))
     assert torch.equal(printed.color_gradients, plain.color_gradients)  # no information, no gradient
@@ -289,47 +233,6 @@ def test_a_flat_tile_scores_zero_as_printed_and_one_with_the_floor():
 
 
 # --- extremes -------------------------------------------------------------------------------------------------------
-
-
-def gradient_bound(loss, samples):
-    """The docstrings' bound of each entry, [P, 1]."""
-    weights = torch.ones(len(samples)) if samples.weights is None else samples.weights
-    l1 = weights[:, None] / (3 * samples.filled.sum())
-    return l1 + getattr(loss, "ncc_weight", 0.0) / len(samples.tile_ids)
-
-
-def extreme_tiles():
-    """Name -> (colours, targets) of a tile of 30 samples."""
-    generator = torch.Generator().manual_seed(6)
-    noise, texture = torch.rand(2, 30, 3, generator=generator)
-    flat = torch.full((30, 3), 0.3)
-    return {
-        "both constant": (flat + 0.2, flat),
-        "truth constant": (noise, flat),
-        "truth constant, prediction nearly": (flat + 1e-5 * noise, flat),
-        "prediction constant": (flat, texture),
-        "clipped white": (torch.ones(30, 3) + 0.1 * noise, torch.ones(30, 3)),
-        "black": (torch.zeros(30, 3), torch.zeros(30, 3)),
-        "values of 1e4": (1e4 * noise, texture),
-        "values of 1e4 on one pixel": (flat + 1e4 * torch.eye(30)[:, :1], texture),
-        "constant 1e4": (flat + 1e4, flat),
-        "almost equal": (texture + 1e-7 * noise, texture),
-        "inverted": (1 - texture, texture),
-        "quantised": (noise, (texture * 2 / 255).round() / 2),
-    }
-
-
-@pytest.mark.parametrize("loss", STRUCTURED, ids=repr)
-def test_gradients_stay_below_the_stated_bound(loss):
-    """On every extreme tile whole, on one and on two of its samples, with weights and without."""
-    for (name, tile), count, weighted in itertools.product(extreme_tiles().items(), (1, 2, 30), (False, True)):
-        colors, targets = (values[:count] for values in tile)
-        samples = make_samples([count], weights=torch.linspace(0.1, 1.9, count) if weighted else None)
-        result = loss(colors, targets, samples)
-        case = f"{name}, {count} samples, weighted: {weighted}"
-        assert torch.isfinite(result.loss), case
-        assert torch.isfinite(result.color_gradients).all(), case
-        assert (result.color_gradients.abs() <= gradient_bound(loss, samples) * 1.001).all(), case
 
 
 @pytest.mark.parametrize("loss", STRUCTURED, ids=repr)
@@ -376,26 +279,6 @@ def test_a_colour_that_is_not_finite_spoils_nothing(loss, bad):
     assert torch.isfinite(result.color_gradients).all()
     assert (result.color_gradients[0] == 0).all()
     assert result.pixel_errors[0] == 0
-
-
-def test_without_a_single_filled_slot_the_loss_is_zero():
-    result = CharbonnierNccLoss()(torch.zeros(4, 3), torch.zeros(4, 3), make_samples([4], empty=[4]))
-    assert result.loss.abs() < 1e-6
-    assert (result.color_gradients == 0).all()
-
-
-@pytest.mark.parametrize(
-    ("make", "named"),
-    [
-        (lambda: CharbonnierNccLoss(ncc_weight=-0.1), "ncc_weight"),
-        (lambda: CharbonnierNccLoss(structure="cosine"), "structure"),
-        (lambda: CharbonnierNccLoss(variance_constant=0.0), "variance_constant"),
-        (lambda: SparseSsimLoss(ssim_weight=1.1), "ssim_weight"),
-    ],
-)
-def test_invalid_values_are_named(make, named):
-    with pytest.raises(InputError, match=named):
-        make()
 
 
 def test_wrong_shapes_are_named():

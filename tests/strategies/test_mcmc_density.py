@@ -3,7 +3,7 @@ replaced here by ones that change nothing; `stability/test_baseline_density.py` 
 
 import pytest
 import torch
-from gsplat.strategy import MCMCStrategy, ops
+from gsplat.strategy import ops
 from helpers.optimizers import make_gaussians
 
 from turbogs_plugin.errors import InputError
@@ -40,23 +40,6 @@ def test_what_is_added_has_the_step_count_of_what_it_was_copied_from():
     assert (optimizer.moments.exp_avg[COUNT:] == 0).all()
 
 
-def test_iterations_of_noise_alone_make_no_table_for_relocation(monkeypatch):
-    """gsplat's trainer makes its table of binomials once a run; made in every iteration, it would cost milliseconds."""
-    made = []
-    initialize_state = MCMCStrategy.initialize_state
-    monkeypatch.setattr(MCMCStrategy, "initialize_state", lambda self: made.append(1) or initialize_state(self))
-    gaussians = make_gaussians(COUNT, dtype=torch.float32)
-    for iteration in range(599, 602):
-        GsplatMcmcDensity(max_gaussians=COUNT).update(gaussians, Step(iteration, 5000, 3500))
-    assert len(made) == 1
-
-
 def test_a_cpu_is_refused():
     with pytest.raises(InputError, match="'mcmc' needs a GPU"):
         GsplatMcmcDensity().setup(make_gaussians(3))
-
-
-@pytest.mark.parametrize("values", [{"refine_start_iter": -1}, {"max_gaussians": 0}, {"refine_every": 0}])
-def test_refuses(values):
-    with pytest.raises(InputError, match=next(iter(values))):
-        GsplatMcmcDensity(**values)

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from helpers.sampling_cases import SIGMAS, UNITS, random_maps, step
+from helpers.sampling_cases import SIGMAS, UNITS, random_maps, step, successive
 
 from turbogs_plugin.engine.reference.draws import Units, draw_units
 from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, random_words
@@ -14,18 +14,6 @@ from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler, RandomPixelSampler
 
 # --- probabilities --------------------------------------------------------------------------------------------------
-
-
-def successive(weights, count, left):
-    """{frozenset: probability} of `count` draws without replacement from `left`, by enumeration."""
-    sets = {}
-    for order in itertools.permutations(sorted(left), min(count, len(left))):
-        total, probability = sum(weights[i] for i in left), 1.0
-        for index in order:
-            probability *= weights[index] / total
-            total -= weights[index]
-        sets[frozenset(order)] = sets.get(frozenset(order), 0.0) + probability
-    return sets
 
 
 def oldest(ages, count, left):

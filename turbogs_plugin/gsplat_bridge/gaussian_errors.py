@@ -167,13 +167,6 @@ def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
 
     require_keys(info, _INTERSECTION, "info", "pass what gsplat.rasterization returned")
     means2d, cameras = info["means2d"], info["isect_offsets"].shape[0]
-    # distributed=True of several processes leaves the projection of all their cameras, and the tiles of this one's.
-    if info["gaussian_ids"] is None and means2d.shape[0] != cameras:
-        raise InputError(
-            f"info is of a render with distributed=True, means2d of {means2d.shape[0]} cameras and tiles of {cameras}: "
-            "the errors of TurboDensityStrategy and MomentLMOptimizer need one process; do not put "
-            f"'{PREDICTION}' and '{GROUND_TRUTH}' into info, or train on one GPU"
-        )
     if means2d.grad is None and not means2d.requires_grad:
         raise InputError(WITHOUT_GRADIENT)
     images = (cameras, info["height"], info["width"])

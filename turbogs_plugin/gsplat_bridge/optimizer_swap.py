@@ -8,8 +8,8 @@ moves.
 A member's ``state`` holds what is kept for its parameter, as gsplat's operations on rows expect: the moments are
 tensors with one row a Gaussian; "step", which they leave as it is, is one number. The bias correction counts steps of
 the host, as torch's Adam does, not updates of each Gaussian: a new Gaussian, whose moments are zero, then moves faster
-than its rate (`DenseAdam` says by how much), which hosts of few steps live on. Learning rate, betas and eps come from
-the member's own parameter group.
+than its rate (`GaussianMoments` says by how much), which hosts of few steps live on. Learning rate, betas and eps come
+from the member's own parameter group.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
-from turbogs_plugin.engine.rules import ParameterRates
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
 from turbogs_plugin.gsplat_bridge.host import host_gaussians, require_one_process
@@ -36,25 +35,8 @@ operations take every other value for one with rows."""
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
-OPTIONS_NOT_TAKEN = ("weight_decay", "maximize", "amsgrad")
-"""Options of torch's Adam that change its steps, and that the shared update does not know."""
-
-DTYPES = (torch.float32, torch.float64)
-"""Types of parameters: in half precision small steps are lost by rounding, and float16 has no eps of 1e-15."""
-
 MOST_SKIPPED = 100
 """Iterations in a row that may be skipped. A `GradScaler` halves its scale at each, so it needs a few dozen at most."""
-
-
-class _HostRates(LearningRates):
-    """The rates that the host's schedulers have set, whatever the step."""
-
-    def __init__(self, rates: ParameterRates) -> None:
-        super().__init__()
-        self.rates = rates
-
-    def at(self, step: Step) -> ParameterRates:
-        return self.rates
 
 
 class SharedOptimizer:
@@ -190,17 +172,9 @@ class SharedOptimizer:
         """Learning rates, betas and eps of the members' groups.
 
         Raises:
-            InputError: betas or eps differ between members, or are none that Adam can use, or a group asks for one of
-                `OPTIONS_NOT_TAKEN`.
+            InputError: betas or eps differ between members, or are none that Adam can use.
         """
         groups = {name: member.param_groups[0] for name, member in self.members.items()}
-        for name, group in groups.items():
-            for option in OPTIONS_NOT_TAKEN:
-                if group.get(option):
-                    raise InputError(
-                        f"the group of '{name}' has {option} = {group[option]}, which a shared update does not know: "
-                        "leave it out, or keep torch.optim.Adam for all parameters"
-                    )
         betas = {name: tuple(group["betas"]) for name, group in groups.items()}  # lists, where read from JSON or YAML
         epsilons = {name: group["eps"] for name, group in groups.items()}
         for option, values in (("betas", betas), ("eps", epsilons)):
@@ -208,10 +182,10 @@ class SharedOptimizer:
                 raise InputError(
                     f"{option} differ between the members of one shared update: {values}; expected one value"
                 )
-        rates = ParameterRates(**{name: float(group["lr"]) for name, group in groups.items()})
+        rates = {name: float(group["lr"]) for name, group in groups.items()}
         (beta1, beta2), eps = betas["means"], epsilons["means"]
         check_moments_config(beta1, beta2, eps)
-        self.optimizer.learning_rates = _HostRates(rates)
+        self.optimizer.learning_rates = LearningRates(**rates, means_final=rates["means"], batch_scale=1.0)
         self.optimizer.beta1, self.optimizer.beta2, self.optimizer.eps = beta1, beta2, eps
 
     def _pack(self, gaussians: Gaussians) -> GaussianMoments:
@@ -260,34 +234,17 @@ class MemberOptimizer(torch.optim.Optimizer):
         require(len(self.param_groups[0]["params"]) == 1, "params", self.param_groups[0]["params"], "one tensor")
         self.shared = shared
         self.name: str = groups[0]["name"]
-        if self.parameter.dtype not in DTYPES:
-            raise InputError(
-                f"parameter '{self.name}' is of {self.parameter.dtype}: make it float32 or float64; a forward pass in "
-                "half precision is torch.autocast's"
-            )
 
     def __getstate__(self) -> dict[str, Any]:
         """State for copies and pickles, with the part that torch's lacks. Members are copied together, as each
         knows the others."""
         return {**super().__getstate__(), "shared": self.shared, "name": self.name}
 
-    def add_param_group(self, param_group: dict[str, Any]) -> None:
-        """Add the one group that a member is made with; torch calls this.
-
-        Raises:
-            InputError: the member has its group already.
-        """
-        if self.param_groups:
-            raise InputError(
-                f"the optimizer of '{self.param_groups[0]['name']}' takes no second group: give the parameters of "
-                f"group '{param_group.get('name')}' an optimizer of their own"
-            )
-        super().add_param_group(param_group)
-
     @property
     def parameter(self) -> torch.nn.Parameter:
-        """The parameter, never kept: gsplat's operations replace it."""
-        return self.param_groups[0]["params"][0]
+        """The parameter, never kept: gsplat's operations replace it. ValueError where a second group was added."""
+        ((parameter,),) = (group["params"] for group in self.param_groups)
+        return parameter
 
     def observe(self, info: dict[str, Any]) -> None:
         """See `SharedOptimizer.observe`; it is enough that one member is shown it."""

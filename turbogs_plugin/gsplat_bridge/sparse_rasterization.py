@@ -197,15 +197,12 @@ def _map_update(maps: ErrorMaps | None, step: Step | None, device: torch.device)
     """The update of `maps` by the samples' errors; None where neither is given."""
     if maps is None and step is None:
         return None
-    if isinstance(maps, ErrorMaps) and isinstance(step, Step):
-        if maps.errors.device != device:
-            raise InputError(f"maps are on {maps.errors.device}: expected {device} as colors")
-        return MapUpdate(maps, step)
-    for name, value, kind in (("maps", maps, ErrorMaps), ("step", step, Step)):
-        if not isinstance(value, kind):
-            other = "step" if name == "maps" else "maps"
-            raise InputError(f"{name} is a {type(value).__name__}: expected {kind.__name__}, as {other} is given")
-    return None
+    if not isinstance(maps, ErrorMaps) or not isinstance(step, Step):
+        found = f"{type(maps).__name__} and {type(step).__name__}"
+        raise InputError(f"maps and step are {found}: expected ErrorMaps and a Step, both or neither")
+    if maps.errors.device != device:
+        raise InputError(f"maps are on {maps.errors.device}: expected {device} as colors")
+    return MapUpdate(maps, step)
 
 
 def _evaluate_and_learn(
@@ -213,13 +210,8 @@ def _evaluate_and_learn(
 ) -> LossOutput:
     """The output of a loss on samples, whose errors the maps take in."""
     engine = engine_of(colors.device)
-    try:
-        terms = loss.terms
-    except AttributeError:
-        name = type(loss).__name__
-        raise InputError(f"{name} has no terms: inherit from strategies.SparseLoss, or set terms = None") from None
-    if terms is not None:
-        return engine.evaluate_and_learn(terms, colors, targets, samples, update)
+    if loss.terms is not None:
+        return engine.evaluate_and_learn(loss.terms, colors, targets, samples, update)
     output = _call(loss, colors, targets, samples)
     engine.learn(samples, colors, output, update)
     return output
@@ -316,8 +308,6 @@ def _check_tensors(given: dict[str, Any]) -> None:
     """All are tensors, float32 or float64 as the means are, on the means' device; cameras want no gradient."""
     means = given["means"]
     for name, value in given.items():
-        if not isinstance(value, Tensor):
-            raise InputError(f"{name} is a {type(value).__name__}: expected a tensor")
         if value.dtype not in (torch.float32, torch.float64):  # gradients of fewer bits come back not finite
             raise InputError(f"{name} is of {value.dtype}: expected torch.float32 or torch.float64")
         if (value.dtype, value.device) != (means.dtype, means.device):

@@ -1,0 +1,36 @@
+"""Settings that no strategy can use are refused, by their names."""
+
+import math
+
+import pytest
+
+from turbogs_plugin import strategies
+from turbogs_plugin.errors import InputError
+
+REFUSED = {
+    "SinusoidalSchedule": ({"min_views": 0}, {"max_views": 2}, {"pixel_budget": math.nan}, {"alpha": -1.0}),
+    "FixedSchedule": ({"views": 0}, {"pixel_budget": 0.0}),
+    "GeometryAwareViewSampler": ({"distance_weight": -1.0},),
+    "RandomPixelSampler": ({"unit": "warp"}, {"multiple": 0}, {"multiple": 24}, {"multiple": 512}),
+    "ErrorGuidedPixelSampler": ({"hard_ratio": 1.2}, {"stable_ratio": 0.7}, {"mixed": "age"}, {"importance": 1.5}),
+    "CharbonnierNccLoss": ({"ncc_weight": -0.1}, {"structure": "cosine"}, {"variance_constant": 0.0}),
+    "SparseSsimLoss": ({"ssim_weight": 1.1},),
+    "LearningRates": ({"shN": math.nan}, {"means": 0.0}, {"batch_scale": math.inf}),
+    "SparseAdam": ({"beta1": 1.0}, {"beta2": -0.1}, {"eps": 0.0}),
+    "MomentLMOptimizer": ({"units": "metres"}, {"rows": "x"}, {"curvature": -1.0}),
+    "DenseAdam": ({"opacity_reg": -1.0}, {"scale_reg": math.nan}),
+    "ErrorDrivenDensity": (
+        *({"score": "best"}, {"split": "thrice"}, {"refine_every": 0}, {"top_fraction": 0.0}, {"final_keep": 1.5}),
+        *({"choose_by": "weight"}, {"opacity_decay": 1.0}, {"max_gaussians": -1}, {"lambda_base": math.nan}),
+    ),
+    "GsplatDefaultDensity": ({"opacity_reset": "never"}, {"refine_every": 0}, {"refine_start_iter": -1}),
+    "GsplatMcmcDensity": ({"refine_start_iter": -1}, {"max_gaussians": 0}, {"refine_every": 0}),
+}
+"""Strategy -> mappings of one setting each, alone impossible beside the defaults."""
+
+
+@pytest.mark.parametrize("strategy", REFUSED)
+def test_impossible_settings_are_refused_by_name(strategy):
+    for values in REFUSED[strategy]:
+        with pytest.raises(InputError, match=next(iter(values))):
+            getattr(strategies, strategy)(**values)
