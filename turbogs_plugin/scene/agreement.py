@@ -95,7 +95,7 @@ def likeness(scene: Scene, poses: np.ndarray) -> Likeness:
         pixels = places[ids] @ views.cameras.Ks[view_id].double().cpu().numpy().T
         pixels = pixels[:, :2] / pixels[:, 2:]
         within = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
-        ids, columns, lines = ids[within], *pixels[within].astype(np.int64).T
+        ids, columns, lines = ids[within], pixels[within, 0].astype(np.int64), pixels[within, 1].astype(np.int64)
         cells = columns * CELLS // width + (CELLS + 1) * (lines * CELLS // width)
         nearest = np.full(cells.max(initial=0) + 1, np.inf)
         np.minimum.at(nearest, cells, places[ids, 2])
