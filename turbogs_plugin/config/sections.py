@@ -54,11 +54,13 @@ class SceneConfig:
         path: folder of the capture; the command line sets it.
         factor: divisor of the photos' width and height.
         test_every: every n-th photo in name order tests.
+        force: train also where cameras, points and photos contradict each other (`turbogs_plugin.scene.agreement`).
     """
 
     path: str = ""
     factor: int = 1
     test_every: int = 8
+    force: bool = False
 
     def __post_init__(self) -> None:
         require(self.factor >= 1, "factor", self.factor, "at least 1")

@@ -69,3 +69,9 @@ class Frame:
         normalised = viewmats.copy()
         normalised[:, :3, 3] = (viewmats[:, :3, 3] + viewmats[:, :3, :3] @ self.center) / self.scale
         return normalised
+
+    def restore_poses(self, viewmats: np.ndarray) -> np.ndarray:
+        """[V, 4, 4] world-to-camera matrices of the normalised frame -> float64 matrices of the capture."""
+        restored = np.asarray(viewmats, dtype=np.float64).copy()
+        restored[:, :3, 3] = restored[:, :3, 3] * self.scale - restored[:, :3, :3] @ self.center
+        return restored

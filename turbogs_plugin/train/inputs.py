@@ -16,6 +16,7 @@ from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.agreement import require_agreement
 from turbogs_plugin.train.clock import WallClock
 from turbogs_plugin.train.run_files import RunFolder
 
@@ -47,7 +48,7 @@ def open_scene(config: Config, folder: RunFolder | None = None, ranks: Ranks = O
             differ in their last digits, and replicas may not.
 
     Raises:
-        InputError: there is no usable capture.
+        InputError: there is no usable capture, or no training on it can work.
     """
     settings = config.scene
     if folder is not None and not Path(settings.path).exists():
@@ -57,6 +58,8 @@ def open_scene(config: Config, folder: RunFolder | None = None, ranks: Ranks = O
         )
     progress = show_loading if ranks.first else None
     scene, cameras = load_and_find(settings.path, settings.factor, settings.test_every, progress, find=ranks.first)
+    if folder is None and not settings.force:
+        require_agreement(scene)
     return with_cameras(scene, ranks.agree(cameras), config.train.refine_cameras)
 
 

@@ -1,0 +1,76 @@
+"""Captures on which no training can work are refused with the likely cause; others are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from turbogs_plugin.captures import load_scene, write_demo_capture
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.agreement import LEAST_LIKENESS, OTHER_AXES, likeness, require_agreement
+from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.types import Cameras
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Scene:
+    return load_scene(write_demo_capture(tmp_path_factory.mktemp("demo") / "capture", views=8, width=64, height=48))
+
+
+def posed(scene: Scene, viewmats: torch.Tensor | np.ndarray) -> Scene:
+    cameras = Cameras(torch.as_tensor(viewmats).float(), scene.train.cameras.Ks, scene.train.cameras.sizes)
+    return replace(scene, train=replace(scene.train, cameras=cameras))
+
+
+def inverted(scene: Scene) -> Scene:
+    """The scene of a file whose poses are from camera to world."""
+    poses = np.linalg.inv(scene.frame.restore_poses(scene.train.cameras.viewmats.numpy()))
+    return posed(scene, scene.frame.normalise_poses(poses))
+
+
+def shares(scene: Scene) -> Scene:
+    Ks = scene.train.cameras.Ks.clone()
+    Ks[:, 0] /= 64.0
+    Ks[:, 1] /= 48.0
+    cameras = Cameras(scene.train.cameras.viewmats, Ks, scene.train.cameras.sizes)
+    return replace(scene, train=replace(scene.train, cameras=cameras))
+
+
+def transparent(scene: Scene) -> Scene:
+    photos = scene.train.photos
+    return replace(scene, train=replace(scene.train, photos=Photos(torch.zeros(len(photos.colors), 4), photos.sizes)))
+
+
+CONTRADICTIONS = {
+    "other axes": (lambda s: posed(s, OTHER_AXES @ s.train.cameras.viewmats.double().numpy()), "columns 2 and 3"),
+    "inverse poses": (inverted, "invert each pose"),
+    "points of another scene": (lambda s: replace(s, point_colors=s.point_colors.flip(0)), "of one solve"),
+    "points far away": (lambda s: replace(s, points=s.points + 100.0), "cameras see no points: .*one frame"),
+    "intrinsics in shares": (shares, "in pixels"),
+    "no alpha": (transparent, "alpha 0"),
+}
+
+
+@pytest.mark.parametrize("case", CONTRADICTIONS)
+def test_a_contradiction_is_refused_with_its_cause(scene, case):
+    make, told = CONTRADICTIONS[case]
+    with pytest.raises(InputError, match=told) as refused:
+        require_agreement(make(scene))
+    assert "\n" not in str(refused.value) and "scene.force=true" in str(refused.value)
+
+
+def test_good_captures_pass_by_a_wide_margin(scene):
+    require_agreement(scene)
+    assert (
+        likeness(scene, scene.frame.restore_poses(scene.train.cameras.viewmats.numpy())).correlation
+        > 3 * LEAST_LIKENESS
+    )
+
+
+def test_what_cannot_be_told_passes(scene):
+    other = replace(scene, point_colors=scene.point_colors.flip(0))
+    require_agreement(replace(other, point_colors=torch.full_like(scene.point_colors, 128)))  # clouds without colours
+    require_agreement(replace(other, points=scene.points[:40], point_colors=other.point_colors[:40]))
+    require_agreement(replace(other, points=scene.points + 100.0, drawn_points=True))

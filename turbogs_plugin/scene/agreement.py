@@ -1,0 +1,121 @@
+"""Agreement of a scene's cameras, points and photos. Where they contradict each other, a training runs to its end and
+has learnt nothing, so it is refused before its first iteration."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.geometry import evenly
+from turbogs_plugin.scene.scene import PosedImages, Scene
+
+SHORTEST_LENS = 0.05
+"""Focal length over the photo's width below which it is no number of pixels. 0.05 is a view of 169 degrees; photos are
+undistorted to 120 degrees at most."""
+MOST_POINTS, MOST_PHOTOS, MOST_PIXELS = 20_000, 16, 4096
+"""Points, photos, and pixels of a photo that are examined, evenly spread."""
+FEWEST_PLACES = 50
+"""Places of points within the examined photos, below which the cameras look elsewhere."""
+CELLS = 40
+"""Cells over a photo's width. The nearest point of a cell is taken for visible, the points behind it for hidden."""
+LEAST_LIKENESS, LIKENESS, FEWEST_COLORS = 0.2, 0.4, 500
+"""Likeness below which photos do not show the points, the likeness that explains it, and the places that tell. Five
+captures have 0.61 to 0.84; with inverse poses 0.10 at most, with poses of other photos or a shifted cloud 0.27."""
+OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Camera axes x right, y down, z forward to axes x right, y up, z backward, and back."""
+
+
+class Likeness(NamedTuple):
+    """How much photos are like the points that their cameras see.
+
+    Args:
+        places: number of visible points over all photos.
+        correlation: of their colours with the photos' colours there; NaN where either are all alike.
+    """
+
+    places: int
+    correlation: float
+
+
+def require_agreement(scene: Scene) -> None:
+    """Refuse a scene on which no training can work.
+
+    Raises:
+        InputError: the likely cause and the remedy.
+    """
+    cause = contradiction(scene)
+    if cause is not None:
+        raise InputError(f"'{scene.name}': {cause}; scene.force=true trains all the same")
+
+
+def contradiction(scene: Scene) -> str | None:
+    """What in a scene contradicts what else, and the likely remedy; None where nothing does.
+
+    A bounded number of its pixels and points is examined.
+    """
+    views = scene.train
+    lens = float(np.median(views.cameras.Ks[:, 0, 0].cpu().numpy() / views.cameras.sizes[:, 0]))
+    if lens < SHORTEST_LENS:
+        return (
+            f"focal lengths are {lens:.2g} of the photos' width, a view of nearly 180 degrees: write focal lengths and "
+            "principal points in pixels, not in shares of the photo"
+        )
+    if views.photos.transparent and not any(_pixels(views, view_id)[:, 3].any() for view_id in _examined(views)):
+        return "all photos are transparent everywhere (alpha 0): write them without alpha"
+    if scene.drawn_points:
+        return None  # nothing says where the scene is
+    poses = scene.frame.restore_poses(views.cameras.viewmats.cpu().numpy())  # [V, 4, 4]
+    found = likeness(scene, poses)
+    unlike = found.places >= FEWEST_COLORS and found.correlation < LEAST_LIKENESS
+    if found.places >= FEWEST_PLACES and not unlike:
+        return None
+    what = "photos do not show the points where the cameras see them" if unlike else "the cameras see no points"
+    for other, remedy in (
+        (OTHER_AXES @ poses, "multiply columns 2 and 3 of each camera-to-world matrix by -1 (its axes are others)"),
+        (np.linalg.inv(poses), "invert each pose's matrix (camera to world is taken for world to camera)"),
+    ):
+        if likeness(scene, other).correlation >= LIKENESS:
+            return f"{what}, and with other poses they do: {remedy}"
+    return f"{what}: poses, points and photos must be of one solve and in one frame"
+
+
+def likeness(scene: Scene, poses: np.ndarray) -> Likeness:
+    """Likeness of the scene's training photos and points by other poses [V, 4, 4], world to camera, in the capture's
+    coordinates."""
+    views, rows = scene.train, evenly(len(scene.points), MOST_POINTS)
+    points = scene.frame.restore_points(scene.points[rows].double().cpu().numpy())  # [M, 3]
+    own = scene.point_colors[rows].cpu().numpy().astype(np.float64)  # [M, 3]
+    shown: list[np.ndarray] = []
+    for view_id in _examined(views):
+        width, height = views.cameras.sizes[view_id].tolist()
+        places = points @ poses[view_id, :3, :3].T + poses[view_id, :3, 3]
+        ids = np.flatnonzero(places[:, 2] > 0)
+        pixels = places[ids] @ views.cameras.Ks[view_id].double().cpu().numpy().T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        within = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
+        ids, columns, lines = ids[within], pixels[within, 0].astype(np.int64), pixels[within, 1].astype(np.int64)
+        cells = columns * CELLS // width + (CELLS + 1) * (lines * CELLS // width)
+        nearest = np.full(cells.max(initial=0) + 1, np.inf)
+        np.minimum.at(nearest, cells, places[ids, 2])
+        visible = places[ids, 2] <= 1.05 * nearest[cells]
+        photo = _pixels(views, view_id, 1)[(lines * width + columns)[visible], :3].astype(np.float64)
+        pair = np.stack([own[ids[visible]], photo])  # [2, N, 3]
+        shown.append(pair - pair.mean(axis=1, keepdims=True) if visible.any() else pair)
+    first, second = np.concatenate(shown, axis=1)
+    with np.errstate(invalid="ignore"):
+        correlation = (first * second).sum() / np.sqrt((first**2).sum() * (second**2).sum())
+    return Likeness(len(first), float(correlation))
+
+
+def _examined(views: PosedImages) -> list[int]:
+    return evenly(len(views), MOST_PHOTOS)
+
+
+def _pixels(views: PosedImages, view_id: int, step: int | None = None) -> np.ndarray:
+    """[N, 3 or 4] uint8: every `step`-th pixel of a photo; None: `MOST_PIXELS` of them."""
+    photos = views.photos
+    photos.fetch([view_id])
+    start, end = photos.offsets[view_id : view_id + 2].tolist()
+    return photos.colors[start : end : step or max(1, (end - start) // MOST_PIXELS)].cpu().numpy()
