@@ -72,12 +72,12 @@ def shown():
                     if not draw_due():
                         over.wait(0.02)
 
-            thread = threading.Thread(target=serve)
+            thread = threading.Thread(target=serve, daemon=True)
             thread.start()
             try:
                 yield page
             finally:
                 over.set()
-                thread.join()
+                thread.join(60.0)
 
     return shown
