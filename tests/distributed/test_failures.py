@@ -10,6 +10,7 @@ import resource
 import shutil
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -189,6 +190,19 @@ def lost_once(words: list[str]) -> None:
     with pytest.raises(SystemExit) as end:
         cli.main()
     assert not end.value.code, end.value.code
+
+
+def joining_twice() -> None:
+    """In every process: joined anew by the launcher's store, which still has the addresses of the first time."""
+    for attempt in ("0", "1"):
+        os.environ["TORCHELASTIC_RESTART_COUNT"] = attempt
+        time.sleep(0.5 * int(os.environ["RANK"]))  # the first process looks before the second one has told its own
+        with joined("cpu") as ranks:
+            assert ranks.agree(attempt) == attempt
+
+
+def test_processes_that_start_again_do_not_call_at_old_addresses(tmp_path):
+    assert ended(start_ranks(2, joining_twice, tmp_path), 60.0) == [0, 0], said(tmp_path)
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from torch import Tensor
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
 from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
-from turbogs_plugin.engine.reference.records import collect_records, gather_colors
+from turbogs_plugin.engine.reference.records import collect_records
 from turbogs_plugin.engine.render_pass import ScreenRecords
 from turbogs_plugin.engine.shared import SharedEngine
 from turbogs_plugin.types import Gaussians
@@ -42,10 +42,7 @@ class Messages:
         message = torch.cat([status.view(torch.float32), *flat])
         counts = [share.num_slots for share in shares]
         parts = self._ranks.to_all(message, [PassStatus.SIZE + 3 * count for count in counts])
-        colors = gather_colors(parts, PassStatus.SIZE, counts, seen)
-        if engine.overflow is not None:
-            engine.overflow.copy_(seen[:1])
-        return colors
+        return SharedEngine.gather(engine, parts, PassStatus.SIZE, counts, seen)  # in torch: for many processes, too
 
     def collect(
         self,
