@@ -17,7 +17,7 @@ from turbogs_plugin.gsplat_bridge import (
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
-from turbogs_plugin.types import Step
+from turbogs_plugin.types import Cameras, Step
 
 
 def stock(monkeypatch) -> dict:
@@ -61,7 +61,7 @@ def test_a_prediction_that_the_host_changed_still_drives_density(monkeypatch, op
 def test_patches_of_another_image_at_each_step():
     host = Host(TurboDensityStrategy(refine_start_iter=1, refine_every=2, grow_grad2d=1e-6))
     for step in range(3):
-        host.cameras.Ks = host.cameras.Ks.clone()
+        host.cameras = Cameras(host.cameras.viewmats, host.cameras.Ks.clone(), host.cameras.sizes)
         host.cameras.Ks[:, :2, 2] -= 3.0
         host.step(step)
     assert len(host.splats["means"]) != 40

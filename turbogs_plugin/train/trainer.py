@@ -189,7 +189,7 @@ def require_samples(samples: PixelSamples, view_ids: Sequence[int], name: str) -
     if samples.view_ids != tuple(view_ids):
         raise InputError(
             f"pixel_sampler.type '{name}' returned samples of views {samples.view_ids}, asked for {tuple(view_ids)}: "
-            "give view_ids to PixelSamples, or to from_mask and from_coordinates"
+            "give view_ids to PixelSamples, or to from_mask"
         )
 
 

@@ -44,20 +44,10 @@ class Cameras:
         self._stack()
         return self._viewmats
 
-    @viewmats.setter
-    def viewmats(self, viewmats: Tensor) -> None:
-        self._stack()
-        self._viewmats = viewmats
-
     @property
     def Ks(self) -> Tensor:
         self._stack()
         return self._Ks
-
-    @Ks.setter
-    def Ks(self, Ks: Tensor) -> None:
-        self._stack()
-        self._Ks = Ks
 
     def select(self, view_ids: Sequence[int]) -> Cameras:
         """The cameras of these views, in this order; `range` for a run of them. Nothing is launched on a device.
