@@ -120,15 +120,6 @@ def test_ages_saturate_and_never_wrap():
     assert maps.ages(0, step(300_000)).tolist() == [AGE_MAX] * 256
 
 
-def test_exact_ages_survive_the_move_of_the_base():
-    maps = ErrorMaps(np.array([[16, 16]]))
-    maps.update(one_tile([7]), torch.ones(1), step(30_000))
-    maps.update(one_tile([8]), torch.ones(1), step(40_000))  # moves the base
-    assert maps.stamp_base == 40_000
-    ages = maps.ages(0, step(50_000))
-    assert (ages[7], ages[8], ages[9]) == (20_000, 10_000, AGE_MAX)
-
-
 def test_resume_is_bit_identical():
     def run(maps, begin, end):
         for t in range(begin, end):

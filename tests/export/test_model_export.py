@@ -134,12 +134,6 @@ def test_a_film_that_cannot_be_made_is_refused(turbogs, finished, tmp_path, monk
     assert not list(tmp_path.iterdir())
 
 
-def test_a_film_without_its_package(turbogs, finished, tmp_path, monkeypatch):
-    monkeypatch.setattr(film.importlib.util, "find_spec", lambda name: None)
-    call = ("render", finished, "--path", "orbit", "--out", tmp_path / "a.mp4")
-    refused(turbogs(*call), "imageio-ffmpeg", "turbogs-plugin[video]")
-
-
 def test_a_film_has_the_background(model, scene, tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     look = replace(model.own_look(), background=WHITE)

@@ -88,9 +88,3 @@ def test_photos_without_gps_among_those_with_it_are_matched_by_order():
 )
 def test_what_counts_as_ordered(names, ordered):
     assert are_ordered(names) is ordered
-
-
-def test_metres_of_degrees():
-    metres = metres_of(np.array([[48.0, 11.0], [48.001, 11.0], [48.0, 11.001], [48.0, 11.0], [48.0, 11.0]]))
-    np.testing.assert_allclose(metres[1] - metres[0], [111.19, 0.0], atol=0.1)
-    np.testing.assert_allclose(metres[2] - metres[0], [0.0, 74.4], atol=0.1)

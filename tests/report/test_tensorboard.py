@@ -103,18 +103,6 @@ def test_nothing_is_written_unless_asked_for(writers, capture, tmp_path):
     assert not writers and not (tmp_path / "run/tensorboard").exists()
 
 
-def test_strips_are_small_and_may_be_none(writers, capture, tmp_path, monkeypatch):
-    monkeypatch.setattr("turbogs_plugin.report.tensorboard.WIDEST_STRIP", 60)
-    config = tiny_config(capture, *SHORT, ASKED)
-    with monkeypatch.context() as without:
-        without.setattr("turbogs_plugin.report.tensorboard.STRIPS", 0)
-        run.train(config, tmp_path / "none", watch=event_writers(config))
-    run.train(config, tmp_path / "run", watch=event_writers(config))
-    none, some = writers
-    assert not none.images and none.scalars
-    assert {pixels.shape for _, pixels, _ in some.images} == {(15, 60, 3)}
-
-
 def test_a_missing_package_is_named_before_anything_is_written(turbogs, capture, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *TINY, ASKED)

@@ -218,10 +218,6 @@ def test_the_front_is_what_nothing_beats(points):
         assert on_front is not beaten
 
 
-def test_nan_is_not_on_the_front():
-    assert pareto_front([(1.0, math.nan), (2.0, 20.0)]) == [False, True]
-
-
 def test_a_summary_of_known_numbers():
     study = Study(
         Ablation("x", {"base": [], "fast": [], "slow": []}),
