@@ -124,5 +124,5 @@ def test_selected_cameras_can_be_copied_saved_and_moved():
     for copied in (copy.deepcopy(chosen), pickle.loads(pickle.dumps(chosen)), chosen.to("cpu"), chosen):
         assert torch.equal(copied.centers, wanted.centers[[2, 1]])
         assert torch.equal(copied.directions, wanted.directions[[2, 1]]) and torch.equal(copied.Ks, wanted.Ks[[2, 1]])
-        assert copied.sizes.tolist() == [[30, 50], [20, 20]] and "Cameras(viewmats=tensor" in repr(copied)
+        assert copied.sizes.tolist() == [[30, 50], [20, 20]]
     assert chosen.to(dtype=torch.float32).viewmats.dtype == torch.float32

@@ -116,10 +116,6 @@ class ErrorMaps:
         `scene/offload.py`.
         """
 
-    def flat_pixels(self, samples: PixelSamples) -> Tensor:
-        """[P] int64: flat pixel of each slot; an empty slot gets the first pixel of its view."""
-        return samples.flat_pixels(self.offsets)
-
     def initialise(self, view_id: int, errors: Tensor) -> None:
         """Set the errors of one whole view.
 

@@ -146,17 +146,6 @@ def test_reduced_copies_and_masks_come_along(copy):
         assert after.train.mask(0).equal(before.train.mask(0)) and not after.train.mask(0).all()
 
 
-def without_model(capture: Path) -> Path:
-    shutil.rmtree(capture / "sparse")
-    return capture
-
-
-def without_photos(capture: Path) -> Path:
-    for photo in sorted((capture / "images").iterdir())[1:]:
-        photo.unlink()
-    return capture
-
-
 def without_points(capture: Path) -> Path:
     model = model_of(capture)
     model.delete_all_points2D_and_points3D()
@@ -179,9 +168,7 @@ def with_other_features(capture: Path) -> Path:
 
 
 REFUSED = [
-    (lambda capture: capture / "absent", "absent has no COLMAP reconstruction"),
-    (without_model, "cup has no COLMAP reconstruction .* by  turbogs reconstruct .*cup --out SCENE"),
-    (without_photos, "names 6 photos, of which 5 are missing in .*01.png, 02.png, 03.png, .*: at least 3 are needed"),
+    (lambda capture: capture / "absent", "absent has no COLMAP reconstruction .* by  turbogs reconstruct"),
     (without_points, "sparse/0 has no points that its photos show"),
     (with_distortion, r"6 of 6 cameras have distortion \(OPENCV\)"),
     (with_other_features, r"half of its points are more than 12.8 pixels \(2% of .*: reconstruct the photos again"),
@@ -199,7 +186,6 @@ def test_a_capture_that_cannot_be_refined_is_refused(copy, monkeypatch, change, 
 @pytest.mark.parametrize(
     ("out", "words"),
     [
-        (".", "--out .* exists: choose a new folder"),
         ("cup/images/new", "--out .*new' would lie among the photos of .*images': choose another folder"),
         ("cup/images/00.png/new", r"--out .*new' cannot be made in .* \(not a folder\): choose a folder to write to"),
     ],

@@ -18,7 +18,6 @@ from turbogs_plugin.train.clock import WallClock
 if TYPE_CHECKING:
     from turbogs_plugin.train.session import RunSession
 
-
 VIEWER_ON_ONE = "--viewer shows a training on one GPU: leave it out, or --gpus"
 
 

@@ -33,9 +33,6 @@ class Cameras:
         self._rows: tuple[int, ...] | None = None
         self._viewmats, self._Ks = viewmats, Ks
 
-    def __repr__(self) -> str:
-        return f"Cameras(viewmats={self.viewmats!r}, Ks={self.Ks!r}, sizes={self.sizes!r})"
-
     def __len__(self) -> int:
         return self._viewmats.shape[0] if self._rows is None else len(self._rows)
 
