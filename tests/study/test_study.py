@@ -93,6 +93,9 @@ def test_another_length_scales_what_counts_iterations_and_nothing_else():
     assert same.train.iterations == WRITTEN_FOR, "a length asked for is not the plan's to change"
     same.train.iterations = config.train.iterations
     assert same.to_yaml() == before
+    number = load_config("turbogs", ["train.iterations=1000"])
+    assert number.train.refine_until == config.train.refine_until, "a number scales nothing"
+    assert with_iterations(number, 500).train.refine_until == 1750
 
 
 def test_the_base_of_an_ablation_is_looked_for_beside_it(tmp_path, monkeypatch):
@@ -101,15 +104,6 @@ def test_the_base_of_an_ablation_is_looked_for_beside_it(tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert variant_config(load_ablation("../ablation.yaml"), "mine", 0, (), None).train.sh_degree == 1
-
-
-def test_what_counts_iterations_is_written_for_the_length_that_is_set_or_else_the_base():
-    auto, number = load_config("turbogs"), load_config("turbogs", ["train.iterations=1000"])
-    assert (auto.train.written_iterations, number.train.written_iterations) == (5000, 1000)
-    assert number.train.refine_until == auto.train.refine_until, "a number scales nothing"
-    assert with_iterations(auto, 500).train.refine_until == 350
-    assert with_iterations(number, 500).train.refine_until == 1750
-    assert with_iterations(with_iterations(auto, 500), 250).train.refine_until == 175
 
 
 def test_events_that_come_sooner_take_less_of_the_opacities():
