@@ -228,15 +228,15 @@ def test_a_cell_that_another_process_trains_is_left_to_it_until_that_dies(small,
     folder, context = StudyFolder(tmp_path / "study"), multiprocessing.get_context("fork")
     folder.write_study(run_cells.Study(load_ablation(str(small)), []))
     key, claimed, end = CellKey(capture.name, "full", 0), context.Event(), context.Event()
-    other = context.Process(target=claim, args=(folder, key, claimed, end))
+    other = context.Process(target=claim, args=(folder, key, claimed, end), daemon=True)
     other.start()
-    claimed.wait()
+    assert claimed.wait(60.0)
     choice = CellChoice([capture], only=["full"], overrides=SETTINGS, steps=4, device="cpu")
     with monkeypatch.context() as patch:
         no_training(patch)
         assert run_study(load_ablation(str(small)), choice, folder.path) == []
     other.kill()
-    other.join()
+    other.join(60.0)
     assert run_study(load_ablation(str(small)), choice, folder.path) == []
     assert [result.key for result in folder.read_study().results] == [key]
 
