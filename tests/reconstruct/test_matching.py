@@ -69,14 +69,6 @@ def test_gps_of_a_room_or_of_a_few_photos_says_nothing():
         assert len(pairs) == 500 * 499 // 2 and "neither names nor GPS" in reason
 
 
-def test_photos_without_gps_among_those_with_it_are_matched_by_order():
-    some = flight(500, 400.0)
-    some[7] = np.nan
-    pairs, _ = choose_pairs(FILM, some)
-    assert_proper(pairs, 500)
-    assert (pairs == 7).any(axis=1).sum() >= 10
-
-
 @pytest.mark.parametrize(
     ("names", "ordered"),
     [

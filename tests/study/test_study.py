@@ -16,7 +16,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.grid import PACKAGE, Ablation, load_ablation, variant_config
 from turbogs_plugin.study.results import CellResult, Study, curve_and_final
 from turbogs_plugin.study.statistics import Difference, Spread, mean_curve, pareto_front, seconds_to_reach, summarise
-from turbogs_plugin.study.study_plots import draw_over_time, shown_rows
+from turbogs_plugin.study.study_plots import draw_over_time
 from turbogs_plugin.study.study_report import report_text
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.yaml_json import packaged_names
@@ -251,13 +251,6 @@ def test_a_capture_without_the_baseline_is_compared_with_nothing():
 
 
 # Plots
-
-
-def test_a_variant_that_failed_does_not_set_the_scale_of_the_plots():
-    results = {"good": 31.0, "fair": 24.0, "lost": 9.5, "unknown": math.nan}
-    cells = [cell(name, 0, entry(0, 0.0, 5.0), entry(100, 10.0, psnr)) for name, psnr in results.items()]
-    (summary,) = summarise(Study(Ablation("x", {name: [] for name in results}), cells), [20.0])
-    assert [row.name for row in shown_rows(summary)] == ["good", "fair", "unknown"]
 
 
 def test_the_plot_of_a_study_has_all_its_captures():

@@ -73,14 +73,6 @@ def test_photo_render_and_error_stand_side_by_side_in_the_middle(state, margin):
     assert all((part == BACKGROUND).all() for part in outside) and views.names[VIEW] in about
 
 
-def test_a_small_comparison_has_the_means_of_its_areas(state):
-    camera = own_size(state, 3, 2 * GAP)
-    whole, _ = draw(state, Picture.COMPARE, camera, VIEW)
-    found, _ = draw(state, Picture.COMPARE, replace(camera, width=camera.width // 2, height=camera.height // 2), VIEW)
-    means = whole.reshape(found.shape[0], 2, found.shape[1], 2, 3).mean(axis=(1, 3))
-    assert np.abs(found - means).max() <= 0.5
-
-
 def test_the_error_map_is_bright_where_the_map_says_so(state):
     maps, _ = state.maps
     width, height = maps.sizes[VIEW].tolist()
@@ -123,10 +115,3 @@ def test_a_state_without_what_a_picture_shows_gives_an_empty_one_and_the_reason(
     for lacking, picture, view in (*absent, (state, Picture.ERRORS, test_view)):
         found, about = draw(lacking, picture, FLAT, view)
         assert (found == BACKGROUND).all() and about
-
-
-def test_test_views_have_photos(state):
-    camera = own_size(state, 3, 2 * GAP)
-    found, about = draw(state, Picture.COMPARE, camera, len(state.capture) + 99)  # brought within bounds
-    photo = to_uint8(state.capture.test.photos.image(0))
-    assert np.array_equal(found[:, : photo.shape[1]], photo) and "test view 1 of 1" in about

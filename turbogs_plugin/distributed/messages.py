@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from turbogs_plugin.distributed.in_place import RADII
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
 from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
@@ -21,9 +22,6 @@ from turbogs_plugin.types import Gaussians
 
 ROW_STEP = 4
 """Runs of rows begin at a multiple of this, so that every parameter of them is aligned to 16 bytes."""
-
-RADII = 2
-"""Radii of a Gaussian in a view."""
 
 
 class Messages:
