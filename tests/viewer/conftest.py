@@ -39,6 +39,14 @@ def new_training(capture, scene):
 
 
 @pytest.fixture(scope="session")
+def unwatched(new_training):
+    """The state at the end of a training that nobody watched. Not to be changed."""
+    alone = new_training()
+    alone.run()
+    return alone.trainer.state_dict()
+
+
+@pytest.fixture(scope="session")
 def untouched(new_training, scene):
     """Not to be changed: `state` is a copy."""
     trainer = new_training().trainer

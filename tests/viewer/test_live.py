@@ -69,15 +69,12 @@ def watched(new_training, scene, monkeypatch):
 
 # In host memory, what a page asks for passes through the window of the training.
 @pytest.mark.parametrize("place", ["device", "host"])
-def test_a_watched_training_ends_as_an_unwatched_one(new_training, watched, monkeypatch, place):
+def test_a_watched_training_ends_as_an_unwatched_one(unwatched, watched, monkeypatch, place):
     monkeypatch.setitem(frames.SHORTEST_INTERVALS, True, 0.0)
-    overrides = (f"train.maps_place={place}", f"train.photos_place={place}")
-    alone = new_training(*overrides)
-    alone.run()
-    page, _, loop = watched(*overrides)
+    page, _, loop = watched(f"train.maps_place={place}", f"train.photos_place={place}")
     loop.run()
     assert len(page.pictures) >= loop.trainer.iteration > 10 and len({frame.tobytes() for frame in page.pictures}) > 6
-    assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())
+    assert_identical(loop.trainer.state_dict(), unwatched)
     assert any("Gaussians" in text and "iteration" in text for text in page.said)
 
 
@@ -98,7 +95,7 @@ def test_what_an_iteration_did_is_shown(watched):
     assert state.samples is not None and len(state.samples) > 0
 
 
-def test_pause_step_and_go_on(new_training, watched, monkeypatch):
+def test_pause_step_and_go_on(unwatched, watched, monkeypatch):
     page, _, loop = watched()
     stopped, clock_stopped = [], loop.clock.stopped
 
@@ -123,9 +120,7 @@ def test_pause_step_and_go_on(new_training, watched, monkeypatch):
     thread.join(60.0)
     assert stopped == [4, 5, 6], "it waited elsewhere, or with the clock running"
     assert loop.finished and any("paused" in text for text in page.said)
-    alone = new_training()
-    alone.run()
-    assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())
+    assert_identical(loop.trainer.state_dict(), unwatched)
 
 
 def test_a_paused_training_can_be_stopped(watched):

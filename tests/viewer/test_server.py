@@ -92,9 +92,7 @@ def test_scripts_of_other_pages_are_turned_away(shown, state):
             client.next_frame(timeout=10.0)
 
 
-def test_a_training_goes_on_while_a_client_looks_and_when_it_leaves_a_pause(new_training, scene):
-    alone = new_training()
-    alone.run()
+def test_a_training_goes_on_while_a_client_looks_and_when_it_leaves_a_pause(new_training, scene, unwatched):
     loop, page = new_training(), Page("127.0.0.1", 0, training=True)
     loop.listeners.append(LiveViewer(page).watch(SimpleNamespace(trainer=loop.trainer, test=scene.test)))
 
@@ -113,7 +111,7 @@ def test_a_training_goes_on_while_a_client_looks_and_when_it_leaves_a_pause(new_
         loop.run()
         pressed.result(60.0)
     assert not page.paused
-    assert_identical(loop.trainer.state_dict(), alone.trainer.state_dict())
+    assert_identical(loop.trainer.state_dict(), unwatched)
 
 
 def test_without_viser_one_line_names_the_extra(turbogs, tmp_path, capture, monkeypatch):
