@@ -197,9 +197,8 @@ def _load_views(
     sizes, own, masked = files.sizes[views], [masks[view] for view in views], None
     photos = load_photos(paths, files.file_sizes[views], sizes, lenses, colors, loaded, meanwhile)
     if any(mask is not None for mask in own):
-        whole = (np.ones((height, width), dtype=bool) for width, height in sizes.tolist())
-        pairs = zip(own, whole, strict=True)
-        masked = PixelMasks.of_views([ViewMask.of(keep) if mask is None else mask for mask, keep in pairs])
+        pairs = zip(own, sizes[:, ::-1].tolist(), strict=True)  # (height, width)
+        masked = PixelMasks.of_views([mask or ViewMask.of(np.ones(size, dtype=bool)) for mask, size in pairs])
     return PosedImages(posed.cameras, tuple(capture.names[v] for v in views), photos, masked, posed.observations)
 
 
