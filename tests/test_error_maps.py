@@ -120,15 +120,6 @@ def test_ages_saturate_and_never_wrap():
     assert maps.ages(0, step(300_000)).tolist() == [AGE_MAX] * 256
 
 
-def test_exact_ages_survive_the_move_of_the_base():
-    maps = ErrorMaps(np.array([[16, 16]]))
-    maps.update(one_tile([7]), torch.ones(1), step(30_000))
-    maps.update(one_tile([8]), torch.ones(1), step(40_000))  # moves the base
-    assert maps.stamp_base == 40_000
-    ages = maps.ages(0, step(50_000))
-    assert (ages[7], ages[8], ages[9]) == (20_000, 10_000, AGE_MAX)
-
-
 def test_resume_is_bit_identical():
     def run(maps, begin, end):
         for t in range(begin, end):
@@ -145,13 +136,11 @@ def test_resume_is_bit_identical():
         assert torch.equal(value, after[name]) if isinstance(value, torch.Tensor) else value == after[name]
 
 
-def test_state_is_a_copy_and_must_fit():
+def test_state_is_a_copy():
     maps = ErrorMaps(SIZES)
     state = maps.state_dict()
     maps.update(dense_pixels((0,), SIZES[:1], "cpu"), torch.ones(21 * 17), step(0))
     assert state["errors"].sum() == 0
-    with pytest.raises(ValueError, match="other views"):
-        ErrorMaps(SIZES[:2]).load_state_dict(state)
 
 
 def test_errors_come_without_their_graph():
@@ -185,15 +174,3 @@ def test_wrong_shape_and_options_are_named():
         ErrorMaps(SIZES, beta=0.0)
     with pytest.raises(InputError, match="refresh"):
         ErrorMaps(SIZES, refresh=0)
-
-
-def test_means_follow_the_sums_and_are_the_callers_own():
-    """Also where the sums are the same array as before, as on a GPU from one refresh to the next."""
-    maps = ErrorMaps(np.array([(2, 2), (4, 1)]))
-    first, second = np.array([4.0, 8.0]), np.array([2.0, -1e-9])
-    arrays = iter([first, first, second, first])
-    maps._means.read = lambda: next(arrays)
-    for expected in ([1.0, 2.0], [1.0, 2.0], [0.5, 0.0], [1.0, 2.0]):
-        means = maps.view_means()
-        assert means.tolist() == expected
-        means[:] = -1.0

@@ -1,4 +1,4 @@
-"""`PixelSamples` of given pixels."""
+"""`PixelSamples` of given pixels, and selected cameras."""
 
 import copy
 import pickle
@@ -13,14 +13,6 @@ from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import PixelSamples, TileGrid, sample_order
 
 SIZES = np.array([(37, 21), (16, 50)])
-
-
-def some_pixels(count: int, seed: int = 0):
-    """Views, x and y [P] of distinct pixels of images of `SIZES`, in no order."""
-    generator = torch.Generator().manual_seed(seed)
-    every = [(view, x, y) for view, (width, height) in enumerate(SIZES) for x in range(width) for y in range(height)]
-    chosen = torch.randperm(len(every), generator=generator)[:count]
-    return torch.tensor(every)[chosen].unbind(dim=1)
 
 
 def assert_in_order(samples: PixelSamples) -> None:
@@ -39,22 +31,9 @@ def assert_in_order(samples: PixelSamples) -> None:
     assert torch.equal(samples.tile_ids[tiles].long(), places)
 
 
-def as_set(views, x, y) -> set[tuple[int, int, int]]:
-    return set(zip(views.tolist(), x.tolist(), y.tolist(), strict=True))
-
-
-@pytest.mark.parametrize("count", [1, 2, 300])
-def test_coordinates_come_in_the_order_of_samples(count):
-    views, x, y = some_pixels(count)
-    samples = PixelSamples.from_coordinates(views.int(), x, y, SIZES, view_ids=(7, 3))
-    assert samples.view_ids == (7, 3) and len(samples) == count
-    assert_in_order(samples)
-    assert as_set(samples.view_of_slot(), *samples.coordinates().unbind(dim=-1)) == as_set(views, x, y)
-
-
 def test_all_pixels_are_the_dense_samples():
-    expected = dense_pixels((0, 1), SIZES, "cpu")
-    samples = PixelSamples.from_coordinates(*some_pixels(37 * 21 + 16 * 50), SIZES)
+    expected = dense_pixels((0, 1), SIZES[[0, 0]], "cpu")
+    samples = PixelSamples.from_mask(torch.ones(2, 21, 37, dtype=torch.bool))
     for name in ("pixel_ids", "tile_ids", "tile_offsets"):
         assert torch.equal(getattr(samples, name), getattr(expected, name))
 
@@ -94,47 +73,24 @@ def test_a_view_without_pixels_stays_in_the_batch():
     assert samples.tile_ids.tolist() == [17]  # of 3 * 6
 
 
-ONE = torch.tensor([1])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ((torch.tensor([0, 2]), ONE.repeat(2), ONE.repeat(2), SIZES), r"outside its image \(view 2, x 1, y 1\)"),
-        ((ONE, torch.tensor([16]), ONE, SIZES), r"outside its image \(view 1, x 16, y 1\)"),
-        ((ONE, ONE, -ONE, SIZES), r"outside its image \(view 1, x 1, y -1\)"),
-        ((ONE.repeat(2), ONE.repeat(2), ONE.repeat(2), SIZES), r"twice \(view 1, x 1, y 1\)"),
-        ((ONE, ONE.float(), ONE, SIZES), "x is not a tensor of integers"),
-        ((ONE, ONE, [1], SIZES), "y is not a tensor of integers"),
-        ((ONE.repeat(2), ONE, ONE, SIZES), r"views is not .* \[P\] as x and y"),
-        ((ONE[:0], ONE[:0], ONE[:0], SIZES), "P at least 1"),
-        ((ONE, ONE, ONE, (37, 21)), r"sizes have shape \(2,\)"),
-        ((ONE, ONE, ONE, SIZES, (4, 4)), "expected 2 different numbers of views"),
-    ],
-)
-def test_pixels_that_do_not_fit_are_refused(arguments, words):
-    with pytest.raises(InputError, match=words):
-        PixelSamples.from_coordinates(*arguments)
-
-
 @pytest.mark.parametrize(
     "mask",
     [torch.ones(4, 4), torch.ones(4, dtype=torch.bool), np.ones((4, 4), bool), torch.zeros(4, 4).bool()],
     ids=str,
 )
 def test_a_mask_that_does_not_fit_is_refused(mask):
-    with pytest.raises(InputError, match=r"a tensor of bool|P at least 1"):
+    with pytest.raises(InputError, match="a tensor of bool"):
         PixelSamples.from_mask(mask)
+    with pytest.raises(InputError, match="expected 2 different numbers of views"):
+        PixelSamples.from_mask(torch.ones(2, 4, 4, dtype=torch.bool), (4, 4))
 
 
 def test_selected_cameras_have_the_matrices_of_now():
     """Selected cameras follow changes of the cameras until then, and gradients."""
     cameras = make_cameras([(40, 30), (20, 20), (30, 50)])
-    for change in range(3):
-        if change == 1:
-            cameras.viewmats = cameras.viewmats + 1.0
-        elif change == 2:
-            cameras.Ks.mul_(2.0)
+    for _ in range(2):
+        cameras.viewmats.add_(1.0)
+        cameras.Ks.mul_(2.0)
         chosen = cameras.select([2, 0])
         assert torch.equal(chosen.viewmats, cameras.viewmats[[2, 0]]) and torch.equal(chosen.Ks, cameras.Ks[[2, 0]])
         assert chosen.sizes.tolist() == [[30, 50], [40, 30]] and len(chosen) == 2
@@ -154,11 +110,10 @@ def test_selected_cameras_share_memory_until_their_matrices_are_read():
     assert viewmats is cameras.viewmats and Ks is cameras.Ks and rows == (0, 2)
     assert cameras.by_row()[2] == range(4) and chosen.sizes.tolist() == [[40, 30], [30, 50]]
     wanted = cameras.viewmats[[0, 2]].clone()
-    cameras.viewmats = torch.zeros_like(cameras.viewmats)  # of other cameras from here on
-    assert torch.equal(chosen.viewmats, wanted)
-    chosen.viewmats[0], chosen.Ks = 0.0, chosen.Ks + 1.0  # a copy of their own
+    chosen.viewmats[0] = 0.0  # a copy of their own
     viewmats, _, rows = chosen.by_row()
     assert list(rows) == [0, 1] and torch.equal(viewmats[1], wanted[1]) and not viewmats[0].any()
+    assert torch.equal(cameras.viewmats[[0, 2]], wanted)
     with pytest.raises(IndexError):
         cameras.select([4])
 
@@ -169,5 +124,5 @@ def test_selected_cameras_can_be_copied_saved_and_moved():
     for copied in (copy.deepcopy(chosen), pickle.loads(pickle.dumps(chosen)), chosen.to("cpu"), chosen):
         assert torch.equal(copied.centers, wanted.centers[[2, 1]])
         assert torch.equal(copied.directions, wanted.directions[[2, 1]]) and torch.equal(copied.Ks, wanted.Ks[[2, 1]])
-        assert copied.sizes.tolist() == [[30, 50], [20, 20]] and "Cameras(viewmats=tensor" in repr(copied)
+        assert copied.sizes.tolist() == [[30, 50], [20, 20]]
     assert chosen.to(dtype=torch.float32).viewmats.dtype == torch.float32

@@ -77,8 +77,6 @@ class ErrorMaps:
         self._allocate()
         self.view_sums = torch.zeros(len(self.sizes), dtype=torch.float64, device=self.device)
         self._means = _LaggedCopy(self.view_sums, self.refresh)
-        self._sums_read: np.ndarray | None = None
-        self._view_means = np.zeros(0)  # means of `_sums_read`
 
     def _allocate(self) -> None:
         self.offsets = np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1))])  # [V + 1]
@@ -117,10 +115,6 @@ class ErrorMaps:
         Call it before reading or writing these arrays. All views are always there in `ErrorMaps`; see
         `scene/offload.py`.
         """
-
-    def flat_pixels(self, samples: PixelSamples) -> Tensor:
-        """[P] int64: flat pixel of each slot; an empty slot gets the first pixel of its view."""
-        return samples.flat_pixels(self.offsets)
 
     def initialise(self, view_id: int, errors: Tensor) -> None:
         """Set the errors of one whole view.
@@ -210,10 +204,7 @@ class ErrorMaps:
         ``2 * refresh - 1`` calls old (between 0 and ``2 * refresh - 1`` after the first call or `initialise`, which
         wait for the device). They depend on the number of calls alone, never on timing.
         """
-        sums = self._means.read()
-        if sums is not self._sums_read:  # a GPU's sums change every `refresh` calls
-            self._sums_read, self._view_means = sums, np.maximum(sums, 0.0) / self._pixel_counts
-        return self._view_means.copy()
+        return np.maximum(self._means.read(), 0.0) / self._pixel_counts
 
     def mean(self) -> float:
         """Mean over the views of their mean error, the schedule's E_mean. Counts as a call of `view_means`."""
@@ -226,11 +217,6 @@ class ErrorMaps:
         return {**state, "view_sums": self.view_sums.clone(), **self._means.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        pixels, views = (int(self.sizes.prod(axis=1).sum()),), (len(self.sizes),)
-        shapes = {"errors": pixels, "stamps": pixels, "view_sums": views, "mean_values": views, "mean_pending": views}
-        for name, shape in shapes.items():
-            if state[name].shape != shape:
-                raise ValueError("the state's error maps are of other views than these")
         self._load(state["errors"], state["stamps"])
         self.stamp_base = int(state["stamp_base"])
         self.view_sums.copy_(state["view_sums"])
@@ -265,38 +251,30 @@ class _LaggedCopy:
     def restart(self) -> None:
         """The next read waits for the device and is exact."""
         self.reads = 0
-        self.values = self.pending = np.zeros(len(self.source))
-        self.copy: tuple[Tensor, torch.cuda.Event] | None = None
+        self.values = self.pending = torch.zeros(len(self.source), dtype=torch.float64)
+        self.arrival: torch.cuda.Event | None = None  # of `pending`
 
     def read(self) -> np.ndarray:
-        """[V] float64, not to be written to; the same array as long as its values are the same ones."""
+        """[V] float64, not to be written to."""
         if not self.source.is_cuda:
-            return self.source.numpy().copy()
+            return self.source.numpy()
         if self.reads % self.refresh == 0:
-            self._collect()
-            self.values = self.source.cpu().numpy() if self.reads == 0 else self.pending
-            if self.copy is None:
-                buffer = torch.empty(self.source.shape, dtype=torch.float64, pin_memory=True)
-                self.copy = buffer, torch.cuda.Event()
-            buffer, event = self.copy
-            buffer.copy_(self.source, non_blocking=True)
-            event.record(torch.cuda.current_stream(self.source.device))
+            self.values = self.source.cpu() if self.reads == 0 else self.arrived()
+            self.pending = self.source.to("cpu", non_blocking=True, copy=True)  # into pinned memory
+            self.arrival = torch.cuda.current_stream(self.source.device).record_event()
         self.reads += 1
-        return self.values
+        return self.values.numpy()
 
-    def _collect(self) -> None:
-        """Take in the copy that was started; by now it has long arrived."""
-        if self.copy is not None:
-            buffer, event = self.copy
-            event.synchronize()
-            self.pending = buffer.numpy().copy()
+    def arrived(self) -> Tensor:
+        """The copy that was started, [V] float64; by now it has long arrived."""
+        if self.arrival is not None:
+            self.arrival.synchronize()
+        return self.pending
 
     def state_dict(self) -> dict[str, Any]:
-        self._collect()
-        values, pending = (torch.from_numpy(array.copy()) for array in (self.values, self.pending))
+        values, pending = self.values.clone(), self.arrived().clone()
         return {"mean_reads": self.reads, "mean_values": values, "mean_pending": pending}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.reads, self.copy = int(state["mean_reads"]), None
-        self.values = state["mean_values"].cpu().numpy().copy()
-        self.pending = state["mean_pending"].cpu().numpy().copy()
+        self.reads, self.arrival = int(state["mean_reads"]), None
+        self.values, self.pending = (state[name].cpu().clone() for name in ("mean_values", "mean_pending"))

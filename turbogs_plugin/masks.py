@@ -16,7 +16,7 @@ from torch import Tensor
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.tiles import TILE_PIXELS, pixel_table, tile_extents
-from turbogs_plugin.types import TILE_SIZE, PixelSamples, TileGrid, sample_order
+from turbogs_plugin.types import TILE_SIZE, PixelSamples, TileGrid
 
 WORD_BITS = 32
 WORDS = TILE_PIXELS // WORD_BITS
@@ -56,13 +56,6 @@ class ViewMask:
         packed = np.packbits(places[live[cut]][:, _PLACES], axis=1, bitorder="little")  # [C, 32] bytes
         bits = np.ascontiguousarray(packed).reshape(-1).view("<i4").astype(np.int32).reshape(-1, WORDS)
         return cls((width, height), live.astype(np.int32), cut, bits, int(counts.sum()))
-
-    @classmethod
-    def whole(cls, size: tuple[int, int]) -> ViewMask:
-        """The mask of a view in which every pixel counts."""
-        width, height = size
-        tiles = np.arange(-(-width // TILE_SIZE) * -(-height // TILE_SIZE), dtype=np.int32)
-        return cls(size, tiles, np.zeros(len(tiles), dtype=bool), np.zeros((0, WORDS), dtype=np.int32), width * height)
 
 
 _PLACES = pixel_table(np.full((1, 2), TILE_SIZE), "cpu")[0].numpy()
@@ -161,16 +154,11 @@ class PixelMasks:
     def strip(self, samples: PixelSamples) -> PixelSamples:
         """Samples of a sampler that knows no masks, without masked pixels, empty slots and tiles with nothing left.
         Weights have a mean of 1 again. The host waits for the device."""
-        tiles, live = self.live_tiles(samples.view_ids)
-        # A last row for tiles that are not live.
-        tiles = torch.cat([tiles, tiles.new_full((1,), torch.iinfo(torch.int64).max)])
-        live = torch.nn.functional.pad(live, (0, 0, 0, 1))
-        ids, of_slot = samples.tile_ids.long(), samples.tile_of_slot()
-        places = torch.searchsorted(tiles, ids)  # [T]
-        places = torch.where(tiles[places] == ids, places, len(tiles) - 1)
-        x, y = samples.coordinates().unbind(dim=1)
-        keep = samples.filled & live[places[of_slot], sample_order(x % TILE_SIZE, y % TILE_SIZE)]
-        counts = torch.zeros_like(samples.tile_ids).index_add_(0, of_slot, keep.int())
+        images = torch.cat([self.image(view).reshape(-1) for view in samples.view_ids])  # of the batch, end to end
+        pixels = self.sizes[list(samples.view_ids)].prod(axis=1)
+        starts = torch.as_tensor(np.cumsum(pixels) - pixels, device=images.device)[samples.view_of_slot()]
+        keep = samples.filled & images[starts + samples.pixel_ids.long().clamp(min=0)]
+        counts = torch.zeros_like(samples.tile_ids).index_add_(0, samples.tile_of_slot(), keep.int())
         left = counts > 0
         weights = None
         if samples.weights is not None:

@@ -87,22 +87,6 @@ def test_contributions_are_the_set_bits_of_the_walked_masks():
     assert counts == {"walked": 96, "contributing": 3 + 32 + 1}
 
 
-def test_floors_grow_with_counts_and_fall_with_bandwidth(monkeypatch):
-    properties = SimpleNamespace(multi_processor_count=132, clock_rate=1_980_000)
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
-    counts = {
-        "tiles": 5_000,
-        "gaussians": 150_000, "instances": 450_000, "visible": 300_000, "intersections": 900_000, "samples": 1_200_000,
-        "items": 15_000, "walked": 3_000_000, "contributing": 1_000_000, "pixels": 3_800_000, "touched": 120_000,
-    }  # fmt: skip
-    usual = floors.step_floors(counts, 4e12)
-    assert usual["solve+update"] == pytest.approx(1e3 * (64 * 300_000 + 8 * 450_000 + 1416 * 120_000) / 4e12)
-    assert usual["BWD"] >= 1e3 * 1_000_000 * 3 * 56 / (4 * 132 * 1.98e9)
-    more = floors.step_floors({name: 2 * value for name, value in counts.items()}, 4e12)
-    slower = floors.step_floors(counts, 1e12)
-    assert all(more[name] > usual[name] and slower[name] >= usual[name] for name in usual)
-
-
 def bench(turbogs, what: str, out: Path, *options: object) -> tuple[str, dict]:
     """What a bench prints, and its file."""
     code, printed, error = turbogs("bench", what, *options, "--out", out, "--device", "cpu")

@@ -29,8 +29,3 @@ def test_the_run_in_the_middle_is_shown(monkeypatch):
     assert measured["median"]["seconds"] == 9.5 and "4.00, 25.00, 4.50" in wall_lines(measured)[-1]
     assert WallRun(9.0, 5.0, 8.0, {"plan": 4.0, "photos": 1.0}).to_first_iteration == 4.0
     assert WallRun(9.0, 5.0, 8.0, {REST: 0.25}).beside_training == 3.75
-
-
-def test_what_the_command_refuses_is_told(turbogs):
-    code, out, err = turbogs("bench", "wall", "--scene", "nowhere", "--repeats", 1, "--device", "cpu")
-    assert (code, out) == (2, "") and err.count("\n") == 1 and "no such scene: nowhere" in err

@@ -9,14 +9,16 @@ import random
 import resource
 import shutil
 import signal
+import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
 from helpers.framework_runs import ENDLESS, TINY, assert_identical, tiny_config
-from helpers.processes import PRELOADED, ended, said, start_ranks
+from helpers.processes import PRELOADED, comes_true, ended, said, start_ranks
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from turbogs_plugin import cli
@@ -191,6 +193,19 @@ def lost_once(words: list[str]) -> None:
     assert not end.value.code, end.value.code
 
 
+def joining_twice() -> None:
+    """In every process: joined anew by the launcher's store, which still has the addresses of the first time."""
+    for attempt in ("0", "1"):
+        os.environ["TORCHELASTIC_RESTART_COUNT"] = attempt
+        time.sleep(0.5 * int(os.environ["RANK"]))  # the first process looks before the second one has told its own
+        with joined("cpu") as ranks:
+            assert ranks.agree(attempt) == attempt
+
+
+def test_processes_that_start_again_do_not_call_at_old_addresses(tmp_path):
+    assert ended(start_ranks(2, joining_twice, tmp_path), 60.0) == [0, 0], said(tmp_path)
+
+
 @pytest.fixture
 def handlers() -> Iterator[None]:
     """Handlers of signals are set back: torchrun's agent sets its own, and leaves them."""
@@ -224,3 +239,60 @@ def test_the_command_starts_processes_itself(capture, tmp_path, turbogs, monkeyp
     (tmp_path / "ending.py").write_text("import sys; sys.exit(int(sys.argv[1]))")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
     assert distributed_processes.start(2, ["2"], "cpu", "ending") == 2
+
+
+# A launcher that is lost
+
+
+def state(process: int) -> tuple[str, int]:
+    """(letter, parent) of a process; X where there is none. One that ended and was not yet waited for is a Z."""
+    try:
+        words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return "X", 0
+    return words[0], int(words[1])
+
+
+def running(processes: list[int]) -> list[int]:
+    return [process for process in processes if state(process)[0] not in "XZ"]
+
+
+def started_by(process: int) -> list[int]:
+    return sorted(int(path.name) for path in Path("/proc").glob("[0-9]*") if state(int(path.name))[1] == process)
+
+
+def left_after_its_kill(words: list[str], folder: Path, working: Callable[[], bool]) -> list[int]:
+    """Start a command, and kill it alone as soon as its processes are `working`: which of them stay.
+
+    One of them hangs then, as in a call of a GPU, and hears nothing but SIGKILL; in a training the other waits for it.
+    """
+    with (folder / "told").open("w") as told:
+        command = [sys.executable, "-m", "turbogs_plugin", *words]
+        launcher = subprocess.Popen(command, stdout=told, stderr=told, start_new_session=True)
+    processes: list[int] = []
+    try:
+        assert comes_true(lambda: working() or launcher.poll() is not None, 2 * SECONDS), "it does not begin"
+        processes = started_by(launcher.pid)
+        assert launcher.poll() is None and len(processes) >= 2, (folder / "told").read_text()
+        os.kill(processes[-1], signal.SIGSTOP)
+        launcher.kill()
+        launcher.wait()
+        comes_true(lambda: not running(processes), 2 * SECONDS)
+        return running(processes)
+    finally:
+        launcher.kill()
+        launcher.wait()
+        for process in running(processes):
+            os.kill(process, signal.SIGKILL)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="by a call of Linux")
+def test_processes_of_a_training_end_with_their_launcher(capture, tmp_path):
+    """A launcher that is killed outright, as by the kernel when memory is short: nothing that it started goes on."""
+    checkpoints = tmp_path / "run/checkpoints"
+    words = ["train", str(capture), "--out", str(tmp_path / "run"), "--gpus", "2", "--device", "cpu", "--no-report"]
+    words += [*TINY, *ENDLESS]
+    assert not left_after_its_kill(words, tmp_path, lambda: latest_checkpoint(checkpoints) is not None)
+    newest = latest_checkpoint(checkpoints)
+    iteration = load_checkpoint(newest)["trainer"]["iteration"]
+    assert iteration >= 3 and newest.name == f"iteration-{iteration:06d}.pt"

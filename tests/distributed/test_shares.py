@@ -74,12 +74,6 @@ def test_shares_are_nearly_even(views, count):
     assert max(abs(size - even) for size in sizes) <= 2 * (NEARLY * even + tile)
 
 
-def test_views_of_several_shares_and_of_none():
-    assert [share.views for share in shares_of(samples_of(EQUAL, 3), 2)] == [slice(0, 2), slice(1, 3)]
-    shares = shares_of(samples_of(EQUAL, 1, "tile", 1e-3), 4)
-    assert sorted(len(share) for share in shares) == [0, 0, 0, 1]
-
-
 @pytest.mark.parametrize("empty", [(), (0,), (1,), (2,), (0, 1), (1, 2), (0, 2), (0, 1, 2)])
 @pytest.mark.parametrize("count", [2, 4])
 def test_a_view_without_samples_is_begun_once(empty, count):

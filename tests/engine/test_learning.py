@@ -58,7 +58,7 @@ def test_a_colour_that_is_not_finite_leaves_its_pixel_alone(case, loss, bad):
     colors[slots, 1] = bad
     output = engine_of(colors.device).supervise(loss.terms, colors, truth, MapUpdate(maps, STEP))
     assert not output.pixel_errors[slots].any() and not output.color_gradients[slots].any()
-    flat = maps.flat_pixels(truth.samples)
+    flat = truth.samples.flat_pixels(maps.offsets)
     kept = torch.zeros(len(maps.errors), dtype=torch.bool)
     kept[: 21 * 17] = True
     kept[flat[slots]] = True

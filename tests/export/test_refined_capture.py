@@ -1,9 +1,7 @@
 """`turbogs export --cameras`: the cameras and points that it writes, what stays as it was, and what is refused."""
 
 import re
-import resource
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -105,14 +103,6 @@ def test_features_tracks_and_colours_stay(given, refined):
     assert sum((point.xyz != before.points3D[number].xyz).any() for number, point in after.points3D.items()) > 40
 
 
-def test_a_point_behind_a_camera_does_not_count_among_the_errors(tmp_path):
-    points = CASE.points.copy()
-    points[0] = [0.0, 0.0, -30.0]
-    write_refined(write_tracked(tmp_path / "cup", replace(CASE, points=points)), tmp_path / "new")
-    assert sum(point.error < 0 for point in model_of(tmp_path / "new").points3D.values()) == 1
-    assert refine_cameras(load_scene(tmp_path / "new"), training=False).reprojection_error < 2.0 * NOISE
-
-
 def test_images_without_a_photo_are_left_out(copy):
     (copy / "images/03.png").unlink()
     new = copy.with_name("new")
@@ -156,17 +146,6 @@ def test_reduced_copies_and_masks_come_along(copy):
         assert after.train.mask(0).equal(before.train.mask(0)) and not after.train.mask(0).all()
 
 
-def without_model(capture: Path) -> Path:
-    shutil.rmtree(capture / "sparse")
-    return capture
-
-
-def without_photos(capture: Path) -> Path:
-    for photo in sorted((capture / "images").iterdir())[1:]:
-        photo.unlink()
-    return capture
-
-
 def without_points(capture: Path) -> Path:
     model = model_of(capture)
     model.delete_all_points2D_and_points3D()
@@ -189,9 +168,7 @@ def with_other_features(capture: Path) -> Path:
 
 
 REFUSED = [
-    (lambda capture: capture / "absent", "absent has no COLMAP reconstruction"),
-    (without_model, "cup has no COLMAP reconstruction .* by  turbogs reconstruct .*cup --out SCENE"),
-    (without_photos, "names 6 photos, of which 5 are missing in .*01.png, 02.png, 03.png, .*: at least 3 are needed"),
+    (lambda capture: capture / "absent", "absent has no COLMAP reconstruction .* by  turbogs reconstruct"),
     (without_points, "sparse/0 has no points that its photos show"),
     (with_distortion, r"6 of 6 cameras have distortion \(OPENCV\)"),
     (with_other_features, r"half of its points are more than 12.8 pixels \(2% of .*: reconstruct the photos again"),
@@ -209,7 +186,6 @@ def test_a_capture_that_cannot_be_refined_is_refused(copy, monkeypatch, change, 
 @pytest.mark.parametrize(
     ("out", "words"),
     [
-        (".", "--out .* exists: choose a new folder"),
         ("cup/images/new", "--out .*new' would lie among the photos of .*images': choose another folder"),
         ("cup/images/00.png/new", r"--out .*new' cannot be made in .* \(not a folder\): choose a folder to write to"),
     ],
@@ -219,13 +195,3 @@ def test_a_place_that_cannot_be_written_is_refused(copy, monkeypatch, out, words
     before = sorted(copy.parent.rglob("*"))
     assert_refused(words, write_refined, copy, copy.parent / out)
     assert sorted(copy.parent.rglob("*")) == before
-
-
-def test_a_full_disk_is_told(given, tmp_path):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
-    try:
-        assert_refused("new' cannot be written whole: make room there", write_refined, given, tmp_path / "new")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert not list(tmp_path.iterdir())

@@ -14,7 +14,7 @@ from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.viewer.camera import ViewerCamera
-from turbogs_plugin.viewer.pictures import CaptureViews, DensityChange, ModelState, Picture, draw
+from turbogs_plugin.viewer.pictures import CaptureViews, ModelState, Picture, draw
 
 pytestmark = [
     pytest.mark.gpu,
@@ -26,13 +26,10 @@ CUDA, CPU = torch.device("cuda"), torch.device("cpu")
 class Watcher:
     """Keeps what a training tells."""
 
-    samples = change = None
+    samples = None
 
     def sampled(self, samples) -> None:
         self.samples = samples
-
-    def changing(self, gaussians, update, step) -> None:
-        self.change = DensityChange.of(gaussians, update)
 
 
 @pytest.fixture(scope="module", params=["device", "host"])
@@ -48,18 +45,16 @@ def subjects(request, tmp_path_factory) -> tuple[ModelState, ModelState]:
     loop.run()
     synchronize(CUDA)
     views = CaptureViews(trainer.views, place_views(scene.test, CUDA, request.param))
-    change, look = watcher.change, Look(trainer.sh_degree, DEFAULT_SETTINGS)
-    here = ModelState(trainer.gaussians, look, views, (trainer.maps, trainer.now), watcher.samples, change)
-    there = ModelState(trainer.gaussians.map(torch.Tensor.cpu), look, CaptureViews(*split(scene)))
-    there.change = DensityChange(change.fresh.cpu(), change.removed.map(torch.Tensor.cpu))
-    return here, there
+    look = Look(trainer.sh_degree, DEFAULT_SETTINGS)
+    here = ModelState(trainer.gaussians, look, views, (trainer.maps, trainer.now), watcher.samples)
+    return here, ModelState(trainer.gaussians.map(torch.Tensor.cpu), look, CaptureViews(*split(scene)))
 
 
 def split(scene):
     return scene.train.to(CPU), scene.test.to(CPU)
 
 
-@pytest.mark.parametrize("picture", [Picture.RENDER, Picture.CHANGES, Picture.COMPARE])
+@pytest.mark.parametrize("picture", [Picture.RENDER, Picture.COMPARE])
 def test_pictures_are_those_of_the_reference(subjects, picture):
     here, there = subjects
     for view in (0, 3, 6):

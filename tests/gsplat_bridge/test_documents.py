@@ -49,7 +49,7 @@ def host() -> dict[str, Any]:
 
 def assert_updated(maps, before, samples, errors):
     """The maps have moved towards the errors [P] at the samples, and nowhere else."""
-    flat, filled = maps.flat_pixels(samples)[samples.filled], samples.filled
+    flat, filled = samples.flat_pixels(maps.offsets)[samples.filled], samples.filled
     moved = (1 - maps.beta) * before[flat].float() + maps.beta * errors[filled]
     torch.testing.assert_close(maps.errors, before.index_copy(0, flat, moved.half()), rtol=2e-3, atol=1e-4)
     assert not torch.equal(maps.errors, before)

@@ -74,12 +74,6 @@ def test_parts_that_weak_pairs_alone_connect_are_together_if_these_agree():
     assert apart == [list(range(12)), list(range(12, 24))]
 
 
-def test_no_pairs_leave_each_photo_alone():
-    none = np.zeros(0, dtype=np.int64)
-    alone = Agreement(("a", "b"), none.reshape(0, 2), none, none)
-    assert consistent_groups(alone) == [[0], [1]]
-
-
 def test_epipolar_distances_are_zero_for_points_and_not_for_others():
     generator = np.random.default_rng(0)
     points = generator.uniform([-1, -1, 4], [1, 1, 8], (50, 3))

@@ -69,14 +69,6 @@ def test_gps_of_a_room_or_of_a_few_photos_says_nothing():
         assert len(pairs) == 500 * 499 // 2 and "neither names nor GPS" in reason
 
 
-def test_photos_without_gps_among_those_with_it_are_matched_by_order():
-    some = flight(500, 400.0)
-    some[7] = np.nan
-    pairs, _ = choose_pairs(FILM, some)
-    assert_proper(pairs, 500)
-    assert (pairs == 7).any(axis=1).sum() >= 10
-
-
 @pytest.mark.parametrize(
     ("names", "ordered"),
     [
@@ -88,9 +80,3 @@ def test_photos_without_gps_among_those_with_it_are_matched_by_order():
 )
 def test_what_counts_as_ordered(names, ordered):
     assert are_ordered(names) is ordered
-
-
-def test_metres_of_degrees():
-    metres = metres_of(np.array([[48.0, 11.0], [48.001, 11.0], [48.0, 11.001], [48.0, 11.0], [48.0, 11.0]]))
-    np.testing.assert_allclose(metres[1] - metres[0], [111.19, 0.0], atol=0.1)
-    np.testing.assert_allclose(metres[2] - metres[0], [0.0, 74.4], atol=0.1)

@@ -40,7 +40,7 @@ def test_training_on_any_errors_keeps_maps_and_samples_valid(
         step = Step(iteration=iteration, total=10**6, refine_until=10**6, seed=seed)
         samples = sampler.sample(maps, views, rate, step)
         filled = samples.filled
-        pixels = maps.flat_pixels(samples)[filled]
+        pixels = samples.flat_pixels(maps.offsets)[filled]
         assert len(torch.unique(pixels)) == len(pixels) > 0
         widths, heights = torch.as_tensor(samples.sizes)[samples.view_of_slot()].unbind(dim=1)
         assert (samples.pixel_ids < widths * heights).all()

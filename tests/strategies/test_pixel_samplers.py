@@ -212,7 +212,7 @@ def test_every_pixel_is_revisited(unit):
     iterations = {"pixel": 256 // 8, "tile": 25}[unit]
     for t in range(iterations):
         samples = ErrorGuidedPixelSampler(unit=unit).sample(maps, (0,), rate, step(t))
-        maps.update(samples, maps.errors[maps.flat_pixels(samples)], step(t))
+        maps.update(samples, maps.errors[samples.flat_pixels(maps.offsets)], step(t))
     assert maps.ages(0, step(iterations)).max() <= iterations
 
 

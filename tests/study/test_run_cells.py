@@ -197,15 +197,6 @@ def test_an_interrupted_study_reports_what_is_there(turbogs, small, capture, tmp
     assert code == 0 and "[2/2]" in err and "[1/2]" not in err
 
 
-def test_variants_of_one_study_may_be_trained_by_several_calls(turbogs, capture, tmp_path):
-    three, out = tmp_path / "three.yaml", tmp_path / "study"
-    three.write_text(SMALL.replace("notes:", "  l1: [loss.type=charbonnier]\nnotes:"))
-    for variant, there in (("random", ["full", "random"]), ("l1", ["full", "random", "l1"])):
-        assert turbogs(*call(three, capture, out, "--only", variant))[0] == 0
-        assert [result.variant for result in StudyFolder(out).read_study().results] == there
-        assert ("loss.type=charbonnier" in (out / "report.md").read_text()) is (variant == "l1")
-
-
 # Several processes
 
 
@@ -237,15 +228,15 @@ def test_a_cell_that_another_process_trains_is_left_to_it_until_that_dies(small,
     folder, context = StudyFolder(tmp_path / "study"), multiprocessing.get_context("fork")
     folder.write_study(run_cells.Study(load_ablation(str(small)), []))
     key, claimed, end = CellKey(capture.name, "full", 0), context.Event(), context.Event()
-    other = context.Process(target=claim, args=(folder, key, claimed, end))
+    other = context.Process(target=claim, args=(folder, key, claimed, end), daemon=True)
     other.start()
-    claimed.wait()
+    assert claimed.wait(60.0)
     choice = CellChoice([capture], only=["full"], overrides=SETTINGS, steps=4, device="cpu")
     with monkeypatch.context() as patch:
         no_training(patch)
         assert run_study(load_ablation(str(small)), choice, folder.path) == []
     other.kill()
-    other.join()
+    other.join(60.0)
     assert run_study(load_ablation(str(small)), choice, folder.path) == []
     assert [result.key for result in folder.read_study().results] == [key]
 
@@ -280,15 +271,12 @@ def test_a_limit_of_memory_which_is_of_a_process_is_refused():
     ("arguments", "words"),
     [
         ("ablate components --out X", ["needs --scene"]),
-        ("ablate component --scene CAPTURE --out X", ["did you mean 'components'"]),
         ("ablate components --scene absent --out X", ["no such scene"]),
-        ("ablate components --scene CAPTURE --out X --only +geo", ["+geo-vs"]),
         ("ablate components --scene CAPTURE --out X --seeds 1 1", ["seeds"]),
         ("ablate components --scene CAPTURE --scene CAPTURE --out X", ["are called the same"]),
         ("ablate components --scene CAPTURE --out X --gpus 0", ["--gpus 0"]),
         ("ablate components budget.time=1s --scene CAPTURE --out X --steps 4", ["time budget 1s exclude each other"]),
         ("ablate components --scene CAPTURE --out CAPTURE", ["not empty"]),
-        ("report CAPTURE CAPTURE --out X", ["holds no run"]),
         ("report CAPTURE --out X", ["two runs or more"]),
         ("report CAPTURE", ["holds no study"]),
         ("report CAPTURE --psnr -1", ["--psnr"]),

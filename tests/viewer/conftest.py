@@ -39,6 +39,14 @@ def new_training(capture, scene):
 
 
 @pytest.fixture(scope="session")
+def unwatched(new_training):
+    """The state at the end of a training that nobody watched. Not to be changed."""
+    alone = new_training()
+    alone.run()
+    return alone.trainer.state_dict()
+
+
+@pytest.fixture(scope="session")
 def untouched(new_training, scene):
     """Not to be changed: `state` is a copy."""
     trainer = new_training().trainer
@@ -72,12 +80,12 @@ def shown():
                     if not draw_due():
                         over.wait(0.02)
 
-            thread = threading.Thread(target=serve)
+            thread = threading.Thread(target=serve, daemon=True)
             thread.start()
             try:
                 yield page
             finally:
                 over.set()
-                thread.join()
+                thread.join(60.0)
 
     return shown

@@ -78,12 +78,11 @@ def test_frames_arrive_as_they_were_drawn_and_pictures_switch(browser, shown, st
             return lambda width, height: draw(state, Picture.RENDER, replace(camera, width=width, height=height))[0]
 
         renders = [tab.comes_to_show(seen_from(0))]
-        for view in (3, 6):
-            page._slider.value = view
-            tab.press("Stand at this view")
-            renders.append(tab.comes_to_show(seen_from(view)))
+        page._slider.value = 6
+        tab.press("Stand at this view")
+        renders.append(tab.comes_to_show(seen_from(6)))
         assert all(image.std() > 5 for image in renders)
-        for picture in (Picture.COMPARE, Picture.ERRORS, Picture.RENDER):
+        for picture in (Picture.COMPARE, Picture.RENDER):
             tab.choose(picture)
             # A colour of a scale may jump with the last digit of a pose: so by the pose that the browser told.
             tab.comes_to_show(lambda *size, picture=picture: draw(state, picture, page.frames.camera, 6)[0])

@@ -5,9 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import tiny_capture
 
-from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.viewer.camera import FOV_LIMITS, LARGEST_SIDE, SMALLEST_SIDE, ViewerCamera
 
 GOOD = {"position": (1.0, 2.0, 3.0), "wxyz": (2.0, 0.0, 0.0, 0.0), "fov": 1.0, "width": 640, "height": 480}
@@ -44,8 +42,8 @@ def test_sizes_and_angles_are_brought_within_limits():
     assert (small.width, small.height) == (160, 120)
 
 
-def test_the_camera_of_a_view_is_that_of_the_capture(tmp_path):
-    cameras = load_scene(tiny_capture(tmp_path)).train.cameras
+def test_the_camera_of_a_view_is_that_of_the_capture(scene):
+    cameras = scene.train.cameras
     for view in range(len(cameras)):
         found = ViewerCamera.of_view(cameras, view).cameras(torch.device("cpu"))
         torch.testing.assert_close(found.viewmats[0], cameras.viewmats[view], atol=1e-5, rtol=0)

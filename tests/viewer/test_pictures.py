@@ -10,18 +10,9 @@ from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS
 from turbogs_plugin.report.images import GAP, strip, to_uint8
 from turbogs_plugin.train.look import Look
-from turbogs_plugin.types import BLACK, Color, Gaussians, PixelSamples, RowUpdate, Step
+from turbogs_plugin.types import BLACK, Color, Gaussians, PixelSamples, Step
 from turbogs_plugin.viewer.camera import ViewerCamera
-from turbogs_plugin.viewer.pictures import (
-    ADDED,
-    BACKGROUND,
-    REMOVED,
-    SAMPLED,
-    DensityChange,
-    ModelState,
-    Picture,
-    draw,
-)
+from turbogs_plugin.viewer.pictures import BACKGROUND, SAMPLED, ModelState, Picture, draw
 
 VIEW = 2
 FLAT = ViewerCamera((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 1.0, 64, 48)
@@ -82,14 +73,6 @@ def test_photo_render_and_error_stand_side_by_side_in_the_middle(state, margin):
     assert all((part == BACKGROUND).all() for part in outside) and views.names[VIEW] in about
 
 
-def test_a_small_comparison_has_the_means_of_its_areas(state):
-    camera = own_size(state, 3, 2 * GAP)
-    whole, _ = draw(state, Picture.COMPARE, camera, VIEW)
-    found, _ = draw(state, Picture.COMPARE, replace(camera, width=camera.width // 2, height=camera.height // 2), VIEW)
-    means = whole.reshape(found.shape[0], 2, found.shape[1], 2, 3).mean(axis=(1, 3))
-    assert np.abs(found - means).max() <= 0.5
-
-
 def test_the_error_map_is_bright_where_the_map_says_so(state):
     maps, _ = state.maps
     width, height = maps.sizes[VIEW].tolist()
@@ -125,40 +108,10 @@ def test_samples_are_shown_where_they_fall(state):
     assert np.array_equal((found == SAMPLED).all(axis=2), masks[0].numpy()) and "view 6 of 7" in about
 
 
-def test_added_is_green_and_removed_is_red():
-    state = spots((-0.4, 0.0, 2.0), (0.0, 0.0, 2.0), (0.4, 0.0, 2.0))
-    before = state.gaussians
-    before.scales += 0.7  # so wide that a pixel beside its middle has its colour
-    # The first stays, the second is copied, the third removed; the copy moves up.
-    update = RowUpdate(torch.tensor([0, 1, 1]), torch.tensor([False, False, True]), {}, num_cloned=1, num_pruned=1)
-    after = update.apply(before)
-    after.means[2, 1] = -0.4
-    change = DensityChange.of(before, update)
-    assert torch.equal(change.removed.means, before.means[2:])
-    found = draw(replace(state, gaussians=after, change=change), Picture.CHANGES, FLAT)[0] / 255.0
-    focal = FLAT.height / (2 * np.tan(0.5))
-
-    def color_at(x: float, y: float) -> np.ndarray:
-        return found[int(24 + focal * y / 2), int(32 + focal * x / 2)]
-
-    np.testing.assert_allclose(color_at(0.0, -0.4), ADDED, atol=0.05)
-    np.testing.assert_allclose(color_at(0.4, 0.0), REMOVED, atol=0.05)
-    np.testing.assert_allclose(color_at(-0.4, 0.0), 0.2, atol=0.03)
-
-
 def test_a_state_without_what_a_picture_shows_gives_an_empty_one_and_the_reason(state):
     alone = spots((0.0, 0.0, 2.0))
-    other = RowUpdate(torch.tensor([0, 0]), torch.tensor([False, True]), {})  # makes a model of two
-    stale = replace(alone, change=DensityChange.of(alone.gaussians, other))
     test_view = len(state.capture) - 1
     absent = [(alone, picture, 0) for picture in Picture if picture is not Picture.RENDER]
-    for lacking, picture, view in (*absent, (stale, Picture.CHANGES, 0), (state, Picture.ERRORS, test_view)):
+    for lacking, picture, view in (*absent, (state, Picture.ERRORS, test_view)):
         found, about = draw(lacking, picture, FLAT, view)
         assert (found == BACKGROUND).all() and about
-
-
-def test_test_views_have_photos(state):
-    camera = own_size(state, 3, 2 * GAP)
-    found, about = draw(state, Picture.COMPARE, camera, len(state.capture) + 99)  # brought within bounds
-    photo = to_uint8(state.capture.test.photos.image(0))
-    assert np.array_equal(found[:, : photo.shape[1]], photo) and "test view 1 of 1" in about

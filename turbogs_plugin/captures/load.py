@@ -197,8 +197,8 @@ def _load_views(
     sizes, own, masked = files.sizes[views], [masks[view] for view in views], None
     photos = load_photos(paths, files.file_sizes[views], sizes, lenses, colors, loaded, meanwhile)
     if any(mask is not None for mask in own):
-        pairs = zip(own, sizes.tolist(), strict=True)
-        masked = PixelMasks.of_views([ViewMask.whole(tuple(size)) if mask is None else mask for mask, size in pairs])
+        pairs = zip(own, sizes[:, ::-1].tolist(), strict=True)  # (height, width)
+        masked = PixelMasks.of_views([mask or ViewMask.of(np.ones(size, dtype=bool)) for mask, size in pairs])
     return PosedImages(posed.cameras, tuple(capture.names[v] for v in views), photos, masked, posed.observations)
 
 

@@ -18,7 +18,6 @@ from turbogs_plugin.train.clock import WallClock
 if TYPE_CHECKING:
     from turbogs_plugin.train.session import RunSession
 
-
 VIEWER_ON_ONE = "--viewer shows a training on one GPU: leave it out, or --gpus"
 
 
@@ -66,7 +65,7 @@ def train(
         raise InputError(f"--gpus {gpus}: it must be at least 1")
     if viewer is not None and (gpus or 1) > 1:
         raise InputError(VIEWER_ON_ONE)
-    from turbogs_plugin.distributed.processes import joined, launched, restarted, start
+    from turbogs_plugin.distributed.processes import joined, launched, restarts, start
     from turbogs_plugin.report.run_report import write_report
     from turbogs_plugin.report.tensorboard import event_writers
     from turbogs_plugin.train import run
@@ -81,7 +80,7 @@ def train(
         return start(gpus, sys.argv[1:], settings.train.device)
     page, watch = write_report if report else None, event_writers(settings)
     with joined(settings.train.device) as ranks, ExitStack() as pages:
-        if out is not None and restarted() and run.RunFolder(out).config.is_file():
+        if out is not None and restarts() and run.RunFolder(out).config.is_file():
             resume = out
         live = None
         if viewer is not None:

@@ -11,19 +11,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from turbogs_plugin.distributed.in_place import RADII
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
 from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
-from turbogs_plugin.engine.reference.records import collect_records, gather_colors
+from turbogs_plugin.engine.reference.records import collect_records
 from turbogs_plugin.engine.render_pass import ScreenRecords
 from turbogs_plugin.engine.shared import SharedEngine
 from turbogs_plugin.types import Gaussians
 
 ROW_STEP = 4
 """Runs of rows begin at a multiple of this, so that every parameter of them is aligned to 16 bytes."""
-
-RADII = 2
-"""Radii of a Gaussian in a view."""
 
 
 class Messages:
@@ -42,10 +40,7 @@ class Messages:
         message = torch.cat([status.view(torch.float32), *flat])
         counts = [share.num_slots for share in shares]
         parts = self._ranks.to_all(message, [PassStatus.SIZE + 3 * count for count in counts])
-        colors = gather_colors(parts, PassStatus.SIZE, counts, seen)
-        if engine.overflow is not None:
-            engine.overflow.copy_(seen[:1])
-        return colors
+        return SharedEngine.gather(engine, parts, PassStatus.SIZE, counts, seen)  # in torch: for many processes, too
 
     def collect(
         self,

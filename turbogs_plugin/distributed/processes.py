@@ -15,7 +15,7 @@ import signal
 import sys
 import traceback
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 
@@ -44,9 +44,9 @@ def launched() -> bool:
     return "RANK" in os.environ and int(os.environ.get("WORLD_SIZE", "1")) > 1
 
 
-def restarted() -> bool:
-    """Whether torchrun started the processes again after one was lost."""
-    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")) > 0
+def restarts() -> int:
+    """How often torchrun has started the processes again after one was lost."""
+    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
 
 
 def start(count: int, arguments: Sequence[str], device: str = "auto", module: str = "turbogs_plugin") -> int:
@@ -120,11 +120,14 @@ def joined(device: str) -> Iterator[Ranks]:
     import torch.distributed as distributed
 
     on_gpu = device != "cpu" and torch.cuda.device_count() > 0
-    gpu = _see_own_gpu() if on_gpu else 0
+    if on_gpu:
+        _see_own_gpu()
     if sys.platform == "linux" and os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE"):
         os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")  # on one machine, whatever its name resolves to
     try:
         store, rank, count = next(distributed.rendezvous("env://", timeout=MEETING))
+        # torchrun keeps its store, where the addresses of lost processes still are: who read one would wait for ever.
+        store = distributed.PrefixStore(f"start {restarts()}", store)
         distributed.init_process_group(
             "cpu:gloo,cuda:nccl" if on_gpu else "gloo", store=store, rank=rank, world_size=count, timeout=TIMEOUT
         )
@@ -138,7 +141,7 @@ def joined(device: str) -> Iterator[Ranks]:
             return True
 
     try:
-        yield ProcessRanks(gpu)
+        yield ProcessRanks()
         with suppress(RuntimeError):  # all is done, whoever has gone already
             distributed.destroy_process_group()
     except (InputError, TrainingStopped, OSError) as error:
@@ -154,7 +157,7 @@ def joined(device: str) -> Iterator[Ranks]:
         os._exit(1)
 
 
-def end_with_parent(alive: Callable[[], bool] = lambda: True) -> None:
+def end_with_parent() -> None:
     """From now on this process is killed when its parent is gone, however that went. Linux only.
 
     The kernel does it, so it works where the main thread waits for a GPU or for another process. The signal is SIGKILL,
@@ -162,32 +165,21 @@ def end_with_parent(alive: Callable[[], bool] = lambda: True) -> None:
     iterations since the last checkpoint: files are written beside their place and renamed.
 
     To be called in a thread that stays, as the kernel keeps the wish with the thread. It also takes the end of the
-    *thread* that started this process for the parent's; launchers wait there for their processes.
-
-    Args:
-        alive: whether the parent was still there after the wish, where its child can tell. Processes of a launcher
-            that was lost before do not meet, as it kept their store, and end with a line after `MEETING`.
+    *thread* that started this process for the parent's; launchers wait there for their processes. A parent that was
+    lost before is not noticed: processes of such a launcher, which kept their store, end with a line after `MEETING`.
     """
     if sys.platform != "linux":
         return
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, *(ctypes.c_ulong(value) for value in (signal.SIGKILL, 0, 0, 0)))
-    if not alive():
-        os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _see_own_gpu() -> int:
-    """Leave this process the GPU of its place on this machine, as the only one. Before CUDA starts.
-
-    Returns:
-        Its number among those that the process still sees.
-    """
+def _see_own_gpu() -> None:
+    """Leave this process the GPU of its place on this machine, as the only one. Before CUDA starts."""
     place, count = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     visible = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(map(str, range(torch.cuda.device_count())))
     names = visible.strip(",").split(",")
     if len(names) < count:
         raise InputError(f"{count} processes need as many GPUs on this machine, {len(names)} answer: start fewer")
     os.environ["CUDA_VISIBLE_DEVICES"] = names[place]
-    if torch.cuda.device_count() == 1:
-        return 0
-    torch.cuda.set_device(place)  # the driver had counted them already
-    return place
+    if torch.cuda.device_count() != 1:
+        raise InputError("CUDA has started before its time: set CUDA_VISIBLE_DEVICES to one GPU for each process")

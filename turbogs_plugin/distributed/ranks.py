@@ -20,9 +20,6 @@ from turbogs_plugin.types import RowUpdate
 
 Value = TypeVar("Value")
 
-CHUNK = 1 << 22
-"""Elements that are compared at a time, to bound the memory of the comparison."""
-
 
 class Ranks:
     """One process.
@@ -84,17 +81,14 @@ class ProcessRanks(Ranks):
 
     Tensors travel by the backend of their device: NCCL on GPUs, gloo on CPUs.
 
-    Args:
-        gpu: number of this process's GPU among those that it sees.
-
     Attributes:
         asked: number of the signal by which this process wants all to stop; 0: none.
     """
 
-    def __init__(self, gpu: int = 0) -> None:
+    def __init__(self) -> None:
         import torch.distributed as distributed
 
-        self._distributed, self._gpu = distributed, gpu
+        self._distributed = distributed
         self.rank, self.count = distributed.get_rank(), distributed.get_world_size()
         self.stop_signal = self.asked = 0
 
@@ -148,7 +142,6 @@ class ProcessRanks(Ranks):
     def meet(self, device: torch.device) -> None:
         # Not on a CPU: gloo takes exchanges of two threads in the order in which they come, which processes differ in.
         if device.type == "cuda":
-            torch.cuda.set_device(self._gpu)  # every thread has a current one
             self.broadcast(torch.zeros(1, device=device))
 
 
@@ -161,28 +154,21 @@ def require_equal(ranks: ProcessRanks, state: dict[str, Any]) -> None:
     Raises:
         TrainingStopped: on all processes, where a tensor or a number of one differs.
     """
-    values = {name: value for name, value in leaves(state, "state") if isinstance(value, Tensor | int | float)}
-    equal = [_is_the_first_ones(ranks, value) for value in values.values()]
-    for rank, found in enumerate(ranks.gather_numbers([int(each) for each in equal])):
+    names, equal = [], []
+    for name, value in leaves(state, "state"):
+        if isinstance(value, Tensor | int | float):
+            own = value.detach() if isinstance(value, Tensor) else torch.tensor(value, dtype=torch.float64)
+            own = own.flatten().clone(memory_format=torch.contiguous_format).view(torch.uint8)
+            first = own.clone()
+            ranks.broadcast(first)
+            names.append(name)
+            equal.append(int(torch.equal(first, own)))
+    for rank, found in enumerate(ranks.gather_numbers(equal)):
         if 0 in found:
             raise TrainingStopped(
-                f"iteration {state['iteration']}: {list(values)[found.index(0)]} of rank {rank} differs from rank 0's, "
+                f"iteration {state['iteration']}: {names[found.index(0)]} of rank {rank} differs from rank 0's, "
                 "though all make equal steps; do the GPUs and their software differ, or is one broken?"
             )
-
-
-def _is_the_first_ones(ranks: ProcessRanks, value: Tensor | int | float) -> bool:
-    """Whether a tensor, or a number, is equal to the first process's; its size is."""
-    equal, flat = (
-        True,
-        value.detach().flatten() if isinstance(value, Tensor) else torch.tensor([value], dtype=torch.float64),
-    )
-    for part in flat.split(CHUNK):
-        own = part.new_empty(len(part)).copy_(part).view(torch.uint8)  # a stride of 1, even of one element
-        first = own.clone()
-        ranks.broadcast(first)
-        equal = equal and torch.equal(first, own)
-    return equal
 
 
 def first_change(ranks: ProcessRanks, update: RowUpdate | None, device: torch.device) -> RowUpdate | None:

@@ -23,7 +23,7 @@ samples of a view are added up. Moments and statistics of owned rows are valid f
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from operator import is_
 from typing import Any
@@ -175,17 +175,6 @@ class RanksEngine:
             copies = owned.copies if self._exchange is self.memory else None
             self.engine.update(rule, own_screen, owned.gaussians, owned.moments, owned.stats, copies)
         self._exchange.stepped(gaussians)
-
-    def each_view(self, errors_of: Callable[[int], Tensor], pixels: Sequence[int]) -> Iterator[Tensor]:
-        for start in range(0, len(pixels), self.ranks.count):
-            group = range(start, min(start + self.ranks.count, len(pixels)))
-            own = errors_of(group[self.ranks.rank]) if self.ranks.rank < len(group) else None
-            for source, view in enumerate(group):
-                errors = own if source == self.ranks.rank else None
-                if errors is None:
-                    errors = torch.empty(pixels[view], device=self.device)
-                self.ranks.broadcast(errors, source)
-                yield errors
 
     def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
         if self._owned is None:

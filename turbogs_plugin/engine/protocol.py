@@ -7,7 +7,7 @@ result, `engine.cuda` its twin; `distributed.ranks_engine` is an engine of sever
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -187,9 +187,6 @@ class Engine(Protocol):
 
     def place(self, gaussians: Gaussians) -> Gaussians:
         """The model where the engine's steps change it: the given one, or a copy over the one placed before."""
-
-    def each_view(self, errors_of: Callable[[int], Tensor], pixels: Sequence[int]) -> Iterator[Tensor]:
-        """The errors [pixels] of one training view after the other, which `errors_of` renders. `pixels`: of each."""
 
     def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
         """Make every row of the moments and the statistics valid, before they are read: after `update` some may not be.

@@ -7,7 +7,7 @@ and its step may change their copies of the model too (`ModelCopies`).
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -139,9 +139,6 @@ class SharedEngine(Engine):
 
     def place(self, gaussians: Gaussians) -> Gaussians:
         return gaussians
-
-    def each_view(self, errors_of: Callable[[int], Tensor], pixels: Sequence[int]) -> Iterator[Tensor]:
-        return map(errors_of, range(len(pixels)))
 
     def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
         """Every row is always valid here."""

@@ -1,18 +1,12 @@
-"""Paths of cameras for films: an orbit about the capture's subject, a way through its cameras, or a file's cameras."""
+"""Paths of cameras for films: an orbit about the capture's subject, or a way through its cameras."""
 
 from __future__ import annotations
 
 import math
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from turbogs_plugin.captures.camera_json import number_of, opengl_viewmat, pinhole, read_frames
-from turbogs_plugin.captures.capture import LARGEST_SIDE
-from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.geometry import camera_centers, evenly, look_at
 from turbogs_plugin.types import Cameras
 
@@ -21,7 +15,7 @@ MOST_KEYS = 24
 SWING = math.pi
 """Largest gap in radians between cameras that surround what they look at; beyond it an orbit swings."""
 WIDEST_FILM = 1920
-"""Pixels of the longer side of a film from the capture's cameras; a file's cameras have their own size."""
+"""Pixels of a film's longer side, at most."""
 
 
 def focus_and_up(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
@@ -71,7 +65,7 @@ def orbit(cameras: Cameras, frames: int) -> Cameras:
     places = places + radius * (np.cos(course)[:, None] * east + np.sin(course)[:, None] * north)
     viewmats = np.stack([look_at(place, focus, up) for place in places])
     K, size = _common_lens(cameras)
-    return _cameras(viewmats, np.repeat(K[None], frames, axis=0), size)
+    return _cameras(viewmats, K, size)
 
 
 def through_views(cameras: Cameras, frames: int) -> Cameras:
@@ -79,50 +73,24 @@ def through_views(cameras: Cameras, frames: int) -> Cameras:
     chosen = evenly(len(cameras), MOST_KEYS)
     keys = cameras.to("cpu").select(chosen)
     K, size = _common_lens(cameras)
-    return interpolated(keys.viewmats.double().numpy(), np.repeat(K[None], len(chosen), axis=0), size, frames)
+    return interpolated(keys.viewmats.double().numpy(), K, size, frames)
 
 
-def from_file(path: Path, frame: Frame, frames: int) -> Cameras:
-    """A smooth way through the cameras of a file in the layout of ``transforms.json``: ``w``, ``h``, ``fl_x`` (or
-    ``camera_angle_x``), ``frames`` with a ``transform_matrix`` each, from camera to world, in the capture's own
-    coordinates and OpenGL's axes. The focal length may change from frame to frame, the size may not.
-
-    Raises:
-        InputError: no such file, or not such a one.
-    """
-    content, entries = read_frames(path)
-    number = partial(number_of, content, path)
-    width, height = (number(name) for name in ("w", "h"))
-    if not (width and height and 2 <= width <= LARGEST_SIDE and 2 <= height <= LARGEST_SIDE):
-        raise InputError(f"{path} has no size of the film: give w and h in pixels")
-    viewmats, Ks = [], []
-    for place, entry in enumerate(entries):
-        values = {**content, **entry}
-        K = pinhole(values, path, (width, height), angles="x")
-        if K is None or K[0, 0] <= 0:
-            raise InputError(f"{path}: camera {place} has neither fl_x nor a camera_angle_x in 0 .. pi")
-        Ks.append(K)
-        owner = f"{path}: the transform_matrix of camera {place}"
-        viewmats.append(opengl_viewmat(entry.get("transform_matrix"), owner))
-    normalised = frame.normalise_poses(np.stack(viewmats))
-    return interpolated(normalised, np.array(Ks), (round(width), round(height)), frames)
-
-
-def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: tuple[int, int], frames: int) -> Cameras:
+def interpolated(viewmats: np.ndarray, K: np.ndarray, size: tuple[int, int], frames: int) -> Cameras:
     """Cameras at even steps of a smooth way through others: centres on a cubic Hermite spline whose tangents are
-    central differences, rotations by slerp, intrinsics by lines.
+    central differences, rotations by slerp.
 
     Args:
         viewmats: [C, 4, 4] float64, world to camera.
-        Ks: [C, 3, 3] float64.
+        K: [3, 3] float64, of all.
         size: (width, height) of the film.
         frames: at least 1.
     """
-    from scipy.interpolate import CubicHermiteSpline, interp1d
+    from scipy.interpolate import CubicHermiteSpline
     from scipy.spatial.transform import Rotation, Slerp
 
     if len(viewmats) == 1:
-        return _cameras(np.repeat(viewmats, frames, axis=0), np.repeat(Ks, frames, axis=0), size)
+        return _cameras(np.repeat(viewmats, frames, axis=0), K, size)
     centers, rotations = camera_centers(viewmats), Rotation.from_matrix(viewmats[:, :3, :3])
     chords = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     turns = (rotations[1:] * rotations[:-1].inv()).magnitude()
@@ -134,7 +102,7 @@ def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: tuple[int, int], fr
     made = np.tile(np.eye(4), (frames, 1, 1))
     made[:, :3, :3] = Slerp(times, rotations)(wanted).as_matrix()
     made[:, :3, 3] = -np.einsum("fij,fj->fi", made[:, :3, :3], places)
-    return _cameras(made, interp1d(times, Ks, axis=0)(wanted), size)
+    return _cameras(made, K, size)
 
 
 def _common_lens(cameras: Cameras) -> tuple[np.ndarray, tuple[int, int]]:
@@ -149,9 +117,10 @@ def _common_lens(cameras: Cameras) -> tuple[np.ndarray, tuple[int, int]]:
     return np.array([[K[0, 0], 0, size[0] / 2], [0, K[1, 1], size[1] / 2], [0, 0, 1.0]]), size
 
 
-def _cameras(viewmats: np.ndarray, Ks: np.ndarray, size: tuple[int, int]) -> Cameras:
-    poses, lenses = (torch.from_numpy(np.ascontiguousarray(value)).float() for value in (viewmats, Ks))
-    return Cameras(poses, lenses, np.tile(np.array(size, dtype=np.int64), (len(viewmats), 1)))
+def _cameras(viewmats: np.ndarray, K: np.ndarray, size: tuple[int, int]) -> Cameras:
+    count = len(viewmats)
+    poses, lenses = (torch.from_numpy(value).float() for value in (viewmats, np.tile(K, (count, 1, 1))))
+    return Cameras(poses, lenses, np.tile(np.array(size, dtype=np.int64), (count, 1)))
 
 
 def _unit(vector: np.ndarray, otherwise: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from turbogs_plugin.captures.bundle_adjustment import (
     of_these_photos,
     refine_together,
 )
-from turbogs_plugin.captures.capture import LARGEST_SIDE, Capture
+from turbogs_plugin.captures.capture import Capture
 from turbogs_plugin.captures.colmap import find_model, load_pycolmap, read_colmap, read_reconstruction, write_whole
 from turbogs_plugin.captures.mask_files import FOLDER as MASKS
 from turbogs_plugin.errors import InputError
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
 PHOTOS, MODEL = "images", "sparse"
 """Folders of the new capture."""
-UNKNOWN = -1.0
-"""COLMAP's own value for the error of a point."""
 
 
 def write_refined(scene: Path, out: Path) -> str:
@@ -135,21 +133,11 @@ def _reconstruction(model: Path, suffix: str, capture: Capture, refined: Refinem
         point.track.elements = [element for element in point.track.elements if element.image_id in kept]
         new.add_point3D_with_id(number, point)
     new.update_point_3d_errors()
-    for point in new.points3D.values():
-        if point.error > LARGEST_SIDE:  # behind a camera that shows it, which counts 1e154 pixels
-            point.error = UNKNOWN
     return new
 
 
 def _photo_folders(scene: Path, capture: Capture) -> dict[str, Path]:
     """The folders of photos, of their reduced copies and of masks, by the names that they get in the new capture."""
-    photos, found = capture.photo_folder, {}
-    whole = re.sub(r"_\d+$", "", photos.name)
-    beside = [] if photos == scene else list(photos.parent.iterdir())
-    for entry in (*beside, *scene.iterdir()):
-        match = re.fullmatch(rf"({re.escape(whole)}|{MASKS})(_\d+)?", entry.name)
-        if match and entry.is_dir():
-            found[f"{MASKS if match[1] == MASKS else PHOTOS}{match[2] or ''}"] = entry
-    if photos.name == whole:
-        found[PHOTOS] = photos
-    return found
+    kept = re.compile(rf"({PHOTOS}|{MASKS})(_\d+)?")
+    found = {entry.name: entry for entry in scene.iterdir() if kept.fullmatch(entry.name) and entry.is_dir()}
+    return {PHOTOS: capture.photo_folder} | found

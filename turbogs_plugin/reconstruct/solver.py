@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -186,10 +185,9 @@ def _pycolmap() -> ModuleType:
 
 @contextmanager
 def _told(step: str) -> Iterator[None]:
-    """Say on stderr what a step was and how long it took. pycolmap ends a step that Ctrl-C interrupts."""
-    started = time.monotonic()
+    """Say on stderr which step has ended. pycolmap ends a step that Ctrl-C interrupts."""
     yield
-    print(f"{step}: {time.monotonic() - started:.1f} s", file=sys.stderr, flush=True)
+    print(step, file=sys.stderr, flush=True)
 
 
 def _rays(camera: pycolmap.Camera, keypoints: np.ndarray) -> np.ndarray:

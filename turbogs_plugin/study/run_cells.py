@@ -181,8 +181,8 @@ def _train_on_gpus(gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder
 
 def _work(gpu: int, gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder, Provenance]) -> list[str]:
     """Task of a process, before it starts CUDA. It ends with the process that started it."""
-    parent = multiprocessing.parent_process()
-    end_with_parent(lambda: parent is not None and parent.is_alive())
+    end_with_parent()
+    assert (parent := multiprocessing.parent_process()) and parent.is_alive(), "the study was ended meanwhile"
     visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
     os.environ["CUDA_VISIBLE_DEVICES"] = visible[gpu] if gpu < len(visible) else str(gpu)
     # With as many threads as cores in each process, all would wait for one another at every parallel loop.

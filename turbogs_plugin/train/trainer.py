@@ -24,7 +24,7 @@ from turbogs_plugin.model.limits import RESTRAIN_EVERY, Clearance, restrain_dist
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.training_state import TrainingState
-from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
+from turbogs_plugin.types import GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
 DROPOUT_UNTIL = 0.95
 """Share of a run after which no Gaussian is left out any more, so that the model is fitted as it is drawn."""
@@ -35,9 +35,6 @@ class IterationObserver(Protocol):
 
     def sampled(self, samples: PixelSamples) -> None:
         """These pixels were sampled."""
-
-    def changing(self, gaussians: Gaussians, update: RowUpdate, step: Step) -> None:
-        """Density control is about to change the model in this way."""
 
 
 class Trainer(TrainingState):
@@ -181,8 +178,6 @@ class Trainer(TrainingState):
             if len(update.source) == 0:
                 raise TrainingStopped(f"iteration {self.iteration}: every Gaussian was removed")
             update = in_order_of_space(update, self.gaussians, self.now)
-            if self.observer is not None:
-                self.observer.changing(self.gaussians, update, self.now)
             self.change_rows(update)
         if self.config.train.distant_size > 0 and self.iteration % RESTRAIN_EVERY == 0:
             restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
@@ -194,7 +189,7 @@ def require_samples(samples: PixelSamples, view_ids: Sequence[int], name: str) -
     if samples.view_ids != tuple(view_ids):
         raise InputError(
             f"pixel_sampler.type '{name}' returned samples of views {samples.view_ids}, asked for {tuple(view_ids)}: "
-            "give view_ids to PixelSamples, or to from_mask and from_coordinates"
+            "give view_ids to PixelSamples, or to from_mask"
         )
 
 

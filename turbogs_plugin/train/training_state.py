@@ -107,9 +107,8 @@ class TrainingState:
 
     def initialise_maps(self) -> None:
         """Set the maps to the errors of a dense render of the initial Gaussians, Algorithm 1's initialization."""
-        pixels = self.maps.sizes.prod(axis=1).tolist()
-        for view_id, errors in enumerate(self.engine.each_view(self.dense_errors, pixels)):
-            self.maps.initialise(view_id, errors)
+        for view_id in range(len(self.maps.sizes)):
+            self.maps.initialise(view_id, self.dense_errors(view_id))
         self.initial_error = self.maps.mean()
 
     def dense_errors(self, view_id: int) -> Tensor:

@@ -33,9 +33,6 @@ class Cameras:
         self._rows: tuple[int, ...] | None = None
         self._viewmats, self._Ks = viewmats, Ks
 
-    def __repr__(self) -> str:
-        return f"Cameras(viewmats={self.viewmats!r}, Ks={self.Ks!r}, sizes={self.sizes!r})"
-
     def __len__(self) -> int:
         return self._viewmats.shape[0] if self._rows is None else len(self._rows)
 
@@ -44,20 +41,10 @@ class Cameras:
         self._stack()
         return self._viewmats
 
-    @viewmats.setter
-    def viewmats(self, viewmats: Tensor) -> None:
-        self._stack()
-        self._viewmats = viewmats
-
     @property
     def Ks(self) -> Tensor:
         self._stack()
         return self._Ks
-
-    @Ks.setter
-    def Ks(self, Ks: Tensor) -> None:
-        self._stack()
-        self._Ks = Ks
 
     def select(self, view_ids: Sequence[int]) -> Cameras:
         """The cameras of these views, in this order; `range` for a run of them. Nothing is launched on a device.

@@ -108,7 +108,7 @@ class PixelSamples:
 
     @classmethod
     def from_mask(cls, mask: Tensor, view_ids: Sequence[int] | None = None) -> PixelSamples:
-        """The pixels of a mask. On a GPU the host waits once, to count them.
+        """The pixels of a mask. On a GPU the host waits, to count them.
 
         Args:
             mask: [H, W] bool of one view, or [K, H, W] of a batch. The samples live on its device.
@@ -117,67 +117,21 @@ class PixelSamples:
         Raises:
             InputError: no such mask, one that is False everywhere, or not one view number for each image.
         """
-        if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.dim() not in (2, 3):
-            raise InputError("mask is not a tensor of bool [H, W] or [K, H, W]")
+        if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.dim() not in (2, 3) or not mask.any():
+            raise InputError("mask is not a tensor of bool [H, W] or [K, H, W] with a pixel that is True")
         mask = mask[None] if mask.dim() == 2 else mask
-        views, y, x = torch.nonzero(mask, as_tuple=True)
-        return cls.from_coordinates(views, x, y, [(mask.shape[2], mask.shape[1])] * len(mask), view_ids)
-
-    @classmethod
-    def from_coordinates(
-        cls,
-        views: Tensor,
-        x: Tensor,
-        y: Tensor,
-        sizes: np.ndarray | Sequence[tuple[int, int]],
-        view_ids: Sequence[int] | None = None,
-    ) -> PixelSamples:
-        """Given pixels in the order of samples, which differs from the given order: `coordinates` and `view_of_slot`
-        tell where each pixel went. On a GPU the host waits for the checks.
-
-        Args:
-            views: [P] integers, position in the batch (0 .. K - 1) of each pixel's view.
-            x, y: [P] integers, column and row of each pixel. The samples live on their device.
-            sizes: [K, 2] (width, height) of the batch's images.
-            view_ids: K training views, for error maps; 0 .. K - 1 where None.
-
-        Raises:
-            InputError: other shapes or types, no pixel, one outside its image, one pixel twice, or not one view number
-                for each image.
-        """
-        sizes = np.asarray(sizes, dtype=np.int64)
-        if sizes.ndim != 2 or sizes.shape[1] != 2 or len(sizes) == 0:
-            raise InputError(f"sizes have shape {sizes.shape}: expected [K, 2], the (width, height) of each image")
-        view_ids = tuple(range(len(sizes)) if view_ids is None else map(int, view_ids))
-        if len(view_ids) != len(sizes) or len(set(view_ids)) < len(view_ids):
-            raise InputError(f"view_ids = {view_ids} is not valid: expected {len(sizes)} different numbers of views")
-        for name, value in (("views", views), ("x", x), ("y", y)):
-            whole = isinstance(value, Tensor) and not value.dtype.is_floating_point and value.dtype != torch.bool
-            if not (whole and value.dim() == 1 and value.shape == x.shape and len(value)):
-                raise InputError(f"{name} is not a tensor of integers [P] as x and y, with P at least 1")
-        views, x, y = views.long(), x.long(), y.long()
-        inside = (views >= 0) & (views < len(sizes))
-        widths, heights = torch.as_tensor(sizes, device=x.device)[views.clamp(0, len(sizes) - 1)].unbind(dim=-1)  # [P]
-        inside &= (x >= 0) & (x < widths) & (y >= 0) & (y < heights)
-
-        def place(pixel: Tensor) -> str:
-            return f"view {int(views[pixel])}, x {int(x[pixel])}, y {int(y[pixel])}"
-
-        if not bool(inside.all()):
-            outside = place((~inside).nonzero()[0])
-            raise InputError(f"a pixel is outside its image ({outside}): sizes (width, height) are {sizes.tolist()}")
+        count, height, width = mask.shape
+        view_ids = tuple(range(count) if view_ids is None else map(int, view_ids))
+        if len(view_ids) != count or len(set(view_ids)) < count:
+            raise InputError(f"view_ids = {view_ids} is not valid: expected {count} different numbers of views")
+        sizes = np.array([(width, height)] * count, dtype=np.int64)
         grid = TileGrid(sizes)
-        columns, starts = (
-            torch.as_tensor(of_view, device=x.device)[views] for of_view in (grid.shapes[:, 0], grid.offsets[:-1])
-        )
-        tiles = starts + y // TILE_SIZE * columns + x // TILE_SIZE  # [P]
-        keys = tiles * TILE_SIZE**2 + sample_order(x % TILE_SIZE, y % TILE_SIZE)  # unique for each pixel
-        keys, order = keys.sort()
-        again = order[1:][keys[1:] == keys[:-1]]
-        if len(again):
-            raise InputError(f"a pixel is given twice ({place(again[0])}): expected each once")
+        views, y, x = torch.nonzero(mask, as_tuple=True)  # [P] each
+        tiles = torch.as_tensor(grid.offsets[:-1], device=mask.device)[views]
+        tiles = tiles + y // TILE_SIZE * int(grid.shapes[0, 0]) + x // TILE_SIZE
+        keys, order = (tiles * TILE_SIZE**2 + sample_order(x % TILE_SIZE, y % TILE_SIZE)).sort()
         tile_ids, counts = torch.unique_consecutive(keys // TILE_SIZE**2, return_counts=True)  # [T] each
-        pixel_ids = (y * widths + x)[order].int()
+        pixel_ids = (y * width + x)[order].int()
         tile_offsets = torch.nn.functional.pad(counts.cumsum(dim=0), (1, 0)).int()
         return cls(view_ids, sizes, pixel_ids, tile_ids.int(), tile_offsets, has_empty_slots=False)
 

@@ -15,8 +15,8 @@ from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.session import RunSession
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
-from turbogs_plugin.viewer.pictures import CaptureViews, DensityChange, ModelState
+from turbogs_plugin.types import PixelSamples
+from turbogs_plugin.viewer.pictures import CaptureViews, ModelState
 from turbogs_plugin.viewer.server import POLL_SECONDS, Page, serve_until_interrupted
 
 
@@ -32,7 +32,6 @@ class LiveViewer(Listener):
         self.trainer: Trainer | None = None
         self._capture: CaptureViews | None = None
         self._samples: PixelSamples | None = None
-        self._change: DensityChange | None = None
         self._psnr = math.nan
 
     def watch(self, session: RunSession) -> LiveViewer:
@@ -56,9 +55,6 @@ class LiveViewer(Listener):
     def sampled(self, samples: PixelSamples) -> None:
         self._samples = samples if self.page.watched else None
 
-    def changing(self, gaussians: Gaussians, update: RowUpdate, step: Step) -> None:
-        self._change = DensityChange.of(gaussians, update) if self.page.watched else None
-
     def stay(self) -> None:
         """Show the model after the training until Ctrl-C."""
         trainer = self.trainer
@@ -67,9 +63,12 @@ class LiveViewer(Listener):
         serve_until_interrupted(self.page, lambda: self._serve(trainer, running=False))
 
     def _hold(self, loop: TrainingLoop) -> None:
-        """Wait until the page asks for an iteration or lets the training go on, or the training is to be stopped."""
+        """Wait until the page asks for an iteration or lets the training go on, or the training is to be stopped.
+        Where no page is open any more, nobody could let it go on, so it does."""
         with loop.clock.stopped():
             while self.page.paused and not loop.stopped:
+                if not self.page.watched:
+                    self.page.pause(False)
                 drawn = self._serve(loop.trainer, running=False)
                 if self.page.steps.acquire(timeout=0.0 if drawn else POLL_SECONDS):
                     break
@@ -93,7 +92,6 @@ class LiveViewer(Listener):
             capture=self._capture,
             maps=(trainer.maps, trainer.now),
             samples=self._samples,
-            change=self._change,
         )
 
     def _status(self, trainer: Trainer, running: bool) -> str:

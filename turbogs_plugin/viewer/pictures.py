@@ -1,12 +1,12 @@
 """The pictures of the viewer, [H, W, 3] uint8, and the state that they show.
 
-The render and the changes are seen by the page's free camera. Comparison, error map, age map and samples show a view of
-the capture, fitted into the page, whatever the free camera does.
+The render is seen by the page's free camera. Comparison, error map, age map and samples show a view of the capture,
+fitted into the page, whatever the free camera does.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -20,21 +20,20 @@ from turbogs_plugin.report.images import ERROR_FULL_SCALE, colored, rounded, str
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.metrics import render_view
-from turbogs_plugin.types import SH_C0, Gaussians, PixelSamples, RowUpdate, Step
+from turbogs_plugin.types import Gaussians, PixelSamples, Step
 from turbogs_plugin.viewer.camera import ViewerCamera
 
 BACKGROUND = 24
 """Grey level where a picture has nothing to show."""
 DIMMED = 0.4
 """Brightness of what is there for orientation only."""
-ADDED, REMOVED, SAMPLED = (0.1, 0.9, 0.25), (1.0, 0.15, 0.15), (255, 170, 0)
+SAMPLED = (255, 170, 0)
 
 
 class Picture(str, Enum):
     """The pictures to choose from; the value is the name on the page."""
 
     RENDER = "Render"
-    CHANGES = "Added and removed"
     COMPARE = "Photo | render | error"
     ERRORS = "Error map"
     AGES = "Age map"
@@ -43,27 +42,7 @@ class Picture(str, Enum):
     @property
     def of_view(self) -> bool:
         """Whether it shows a view of the capture, not what the free camera sees."""
-        return self not in (Picture.RENDER, Picture.CHANGES)
-
-
-@dataclass(frozen=True)
-class DensityChange:
-    """The last event of density control.
-
-    Args:
-        fresh: [N] bool, the rows of the present model that it added.
-        removed: the Gaussians that it took away; a Gaussian that was split is replaced, not removed.
-    """
-
-    fresh: Tensor
-    removed: Gaussians
-
-    @classmethod
-    def of(cls, before: Gaussians, update: RowUpdate) -> DensityChange:
-        """The change that `update` makes to the model `before` it."""
-        gone = torch.ones(len(before), dtype=torch.bool, device=before.device)
-        gone[update.source] = False
-        return cls(update.fresh, before.map(lambda value: value[gone]))
+        return self is not Picture.RENDER
 
 
 @dataclass(frozen=True)
@@ -101,7 +80,6 @@ class ModelState:
         capture: its views, for training and for testing.
         maps: errors and ages of the training views, and the time from which ages count.
         samples: pixels of the last iteration.
-        change: the last event of density control.
     """
 
     gaussians: Gaussians
@@ -109,7 +87,6 @@ class ModelState:
     capture: CaptureViews | None = None
     maps: tuple[ErrorMaps, Step] | None = None
     samples: PixelSamples | None = None
-    change: DensityChange | None = None
 
 
 class AbsentError(Exception):
@@ -127,8 +104,6 @@ def draw(state: ModelState, picture: Picture, camera: ViewerCamera, view: int = 
     try:
         if picture is Picture.RENDER:
             return _render(state, camera), ""
-        if picture is Picture.CHANGES:
-            return _changes(state, camera), "Green: added by the last event of density control. Red: removed."
         number = shown_view(state, picture, view)
         draw_view = {Picture.COMPARE: _compare, Picture.SAMPLES: _samples, Picture.AGES: _ages}.get(picture, _errors)
         return _centred(draw_view(state, camera, number), camera), _capture(state).name(number)
@@ -148,21 +123,6 @@ def shown_view(state: ModelState, picture: Picture, view: int) -> int:
 def _render(state: ModelState, camera: ViewerCamera) -> np.ndarray:
     cameras = camera.cameras(state.gaussians.device)
     return to_uint8(render_image(state.gaussians, cameras, **state.look.options).colors)
-
-
-def _changes(state: ModelState, camera: ViewerCamera) -> np.ndarray:
-    """The model in grey, with what was added in green; and in red what was removed, where it was."""
-    model, change = state.gaussians, state.change
-    if change is None or len(change.fresh) != len(model):
-        raise AbsentError("No change yet: wait for the next event of density control of a running training.")
-    colors = (SH_C0 * model.sh0[:, 0] + 0.5).clamp(0.0, 1.0).mean(dim=1, keepdim=True) * DIMMED
-    colors = torch.where(change.fresh[:, None], colors.new_tensor(ADDED), colors.expand(-1, 3))
-    colors = torch.cat([colors, colors.new_tensor(REMOVED).expand(len(change.removed), 3)])
-    removed = dict(change.removed.items())
-    both = Gaussians(**{name: torch.cat([value, removed[name]]) for name, value in model.items()})
-    painted = replace(both, sh0=((colors - 0.5) / SH_C0)[:, None], shN=both.shN[:, :0])
-    cameras = camera.cameras(model.device)
-    return to_uint8(render_image(painted, cameras, sh_degree=0, settings=state.look.settings).colors)
 
 
 def _compare(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:

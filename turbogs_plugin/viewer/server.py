@@ -1,4 +1,4 @@
-"""The web page of the viewer, a viser server: its panel, its clients, the cameras of the capture.
+"""The web page of the viewer, a viser server: its panel and its clients.
 
 viser calls back from threads of its own; these only take down what a client wants. Drawing and encoding happen on the
 thread that owns the model (`frames`).
@@ -12,14 +12,12 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import urlsplit
 
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.frames import Frames
 from turbogs_plugin.viewer.pictures import CaptureViews, Picture
@@ -28,11 +26,6 @@ if TYPE_CHECKING:
     import viser
 
 JPEG_QUALITY = 85
-MOST_FRUSTA = 150
-"""Largest number of cameras drawn into the scene, evenly spread over the capture. The slider reaches all."""
-FRUSTUM_SIZE = 0.06
-"""Size of a camera in the scene, in units of the scene's extent."""
-TRAIN_COLOR, TEST_COLOR = (40, 110, 220), (230, 140, 20)
 POLL_SECONDS = 0.02
 """Seconds between two looks at what the page asks for, where no frame is due."""
 INSTALL = 'pip install "turbogs-plugin[viewer]"'
@@ -77,7 +70,7 @@ class Page:
         training: whether there is a training to control.
 
     Attributes:
-        paused: whether the training waits.
+        paused: whether the training is asked to wait. It waits only while a page is open.
         steps: iterations that a paused training is asked for.
 
     Raises:
@@ -93,26 +86,21 @@ class Page:
         self.server.gui.main_panel.dock_right()
         host = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
         self.url = f"http://{host}:{self.server.get_port()}"
-        self._frusta = self.server.scene.add_frame("/views", show_axes=False, visible=False)
         gui: Any = self.server.gui  # its handles' values cannot be set, says its type
         self._status = gui.add_markdown("Photos are being read, and error maps made.")
         names = [picture.value for picture in Picture]
         self._pictures = gui.add_dropdown("Picture", names, initial_value=names[0])
         self._slider = gui.add_slider("View", 0, 1, 1, 0, visible=False)
         self._there = gui.add_button("Stand at this view", visible=False)
-        self._cameras = gui.add_checkbox("Cameras of the capture", False, visible=False)
         self._training = gui.add_folder("Training", visible=training)
         with self._training:
             self._pause = gui.add_button("Pause")
             self._step = gui.add_button("One step")
-        self._pictures.on_update(lambda _: self._refresh())
         self._there.on_click(lambda _: self.go_to(self._slider.value))
-        self._cameras.on_update(lambda _: self._refresh())
-        self._pause.on_click(lambda _: self.pause(not self.paused))
-        self._step.on_click(lambda _: self.step())
+        self._pause.on_click(self._pause_clicked)
+        self._step.on_click(self._step_clicked)
         self.pause(False)
         self.server.on_client_connect(self._connected)
-        self.server.on_client_disconnect(self._disconnected)
 
     @property
     def watched(self) -> bool:
@@ -129,12 +117,6 @@ class Page:
         self.paused, self.steps = paused, threading.Semaphore(0)
         self._pause.label = "Go on" if paused else "Pause"
 
-    def step(self) -> None:
-        """Ask for one iteration, after which the training waits."""
-        if not self.paused:
-            self.pause(True)
-        self.steps.release()
-
     def show_capture(self, capture: CaptureViews) -> None:
         """Offer the views of a capture, and stand at the first one."""
         self.capture = capture
@@ -143,21 +125,8 @@ class Page:
         if np.linalg.norm(up) > 1e-3:
             self.server.scene.set_up_direction(tuple(up / np.linalg.norm(up)))
         self._slider.max = max(1, len(capture) - 1)
-        self._slider.visible = self._there.visible = self._cameras.visible = True
+        self._slider.visible = self._there.visible = True
         self.stand_at(ViewerCamera.of_view(cameras, 0))
-        for number in evenly(len(capture), MOST_FRUSTA):
-            views, view_id = capture.find(number)
-            camera = ViewerCamera.of_view(views.cameras, view_id)
-            frustum = self.server.scene.add_camera_frustum(
-                f"/views/{number}",
-                fov=camera.fov,
-                aspect=camera.width / camera.height,
-                scale=FRUSTUM_SIZE,
-                color=TRAIN_COLOR if views is capture.train else TEST_COLOR,
-                wxyz=camera.wxyz,
-                position=camera.position,
-            )
-            frustum.on_click(partial(self.go_to, number))
 
     def stand_at(self, camera: ViewerCamera) -> None:
         """Move all clients, those who come later too, to a camera; they turn about a point one unit before it."""
@@ -176,7 +145,7 @@ class Page:
         about = self.frames.about
         self._status.content = f"{line}\n\n{quoted(about) if about else ''}"
 
-    def go_to(self, number: int, event: object = None) -> None:
+    def go_to(self, number: int) -> None:
         """Choose a view, and bring every client's camera there."""
         if self.capture is not None:
             self._slider.value = number = min(max(0, number), len(self.capture) - 1)
@@ -191,17 +160,19 @@ class Page:
         """Turn everybody away."""
         stop(self.server)
 
-    def _refresh(self) -> None:
-        """Show the cameras of the capture where they are asked for and can be seen."""
-        self._frusta.visible = bool(self._cameras.value) and not self.wish()[0].of_view
+    # viser runs asynchronous functions one after the other, in the order of the clicks; others in any order.
+    async def _pause_clicked(self, event: object) -> None:
+        self.pause(not self.paused)
+
+    async def _step_clicked(self, event: object) -> None:
+        """Ask for one iteration, after which the training waits."""
+        if not self.paused:
+            self.pause(True)
+        self.steps.release()
 
     def _connected(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(self._looked)
         self._looked(client.camera)
-
-    def _disconnected(self, client: viser.ClientHandle) -> None:
-        if not self.watched:
-            self.pause(False)  # nobody is left who could let the training go on
 
     def _looked(self, camera: viser.CameraHandle) -> None:
         size = camera.image_width, camera.image_height
