@@ -3,9 +3,7 @@ nor the package: importing them there would keep all cores but one waiting."""
 
 import gc
 import os
-import signal
 import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,23 +25,6 @@ def disks_are_not_waited_for() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
         yield
-
-
-@pytest.fixture(autouse=True)
-def tests_end() -> Iterator[None]:
-    """A test that waits for ever fails after ten minutes, so that its name is told."""
-
-    def late(*_: object) -> None:
-        raise TimeoutError("this test has not ended in ten minutes")
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGALRM, late)
-    signal.alarm(600)
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
 
 
 @pytest.fixture(scope="module")

@@ -1,12 +1,16 @@
 """Paths of cameras: through given ones, without jumps, about what they look at."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from turbogs_plugin.export.camera_path import focus_and_up, interpolated, orbit, through_views
-from turbogs_plugin.scene.geometry import look_at
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.export.camera_path import focus_and_up, from_file, interpolated, orbit, through_views
+from turbogs_plugin.scene import Frame
+from turbogs_plugin.scene.geometry import camera_centers, look_at
 from turbogs_plugin.types import Cameras
 
 K = np.array([[50.0, 0, 24], [0, 50.0, 20], [0, 0, 1]])
@@ -61,3 +65,30 @@ def test_an_orbit_of_cameras_on_one_side_swings_there():
 def test_one_camera_alone(make):
     made = make(ring(np.array([0.3])), 4)
     assert len(made) == 4 and bool(torch.isfinite(made.viewmats).all())
+
+
+def test_a_file_of_cameras_is_in_the_captures_coordinates(tmp_path):
+    frame = Frame(np.array([10.0, 0.0, 0.0]), 2.0)
+    viewmats = ring(np.array([0.0, 0.5])).viewmats.double().numpy()
+    frames = []
+    for viewmat in viewmats:
+        pose = np.linalg.inv(viewmat)
+        pose[:3, 1:3] *= -1.0  # OpenGL's axes
+        frames.append({"transform_matrix": pose.tolist()})
+    content = {"w": 64, "h": 48, "camera_angle_x": 1.0, "frames": frames}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    made = from_file(tmp_path / "a.json", frame, 5)
+    expected = (camera_centers(viewmats) - frame.center) / 2.0
+    assert np.allclose(made.centers[[0, -1]].numpy(), expected, atol=1e-5)
+    assert made.sizes.tolist() == [[64, 48]] * 5 and float(made.Ks[0, 0, 0]) == pytest.approx(32 / np.tan(0.5))
+
+
+WRONG = ({"w": None}, {"w": 0}, {"fl_x": -1.0}, {"frames": []}, {"frames": [{}]}, {"frames": [{"transform_matrix": 1}]})
+
+
+@pytest.mark.parametrize("change", WRONG)
+def test_a_file_of_something_else_is_refused(tmp_path, change):
+    content = {"w": 64, "h": 48, "fl_x": 50.0, "frames": [{"transform_matrix": np.eye(4).tolist()}], **change}
+    (tmp_path / "a.json").write_text(json.dumps({name: value for name, value in content.items() if value is not None}))
+    with pytest.raises(InputError, match=r"a\.json"):
+        from_file(tmp_path / "a.json", Frame(np.zeros(3), 1.0), 3)

@@ -1,5 +1,6 @@
 """`turbogs export`, renders and films: what they write and say, and what they refuse."""
 
+import json
 import re
 import shutil
 from dataclasses import replace
@@ -118,7 +119,7 @@ def test_bad_input_is_one_line(turbogs, finished, capture, tmp_path):
     ("options", "words"),
     [
         (("--path", "orbit", "--out", "a.avi"), ".mp4"),
-        (("--path", "nowhere", "--out", "a.mp4"), "'nowhere' is none of orbit, views"),
+        (("--path", "nowhere", "--out", "a.mp4"), "--path 'nowhere'"),
         (("--path", "orbit", "--out", "a.mp4", "--seconds", "0"), "--seconds 0"),
         (("--path", "orbit", "--out", "absent/a.mp4"), "absent"),
         (("--path", "orbit"), "--out FILE.mp4"),
@@ -137,20 +138,24 @@ def test_a_film_has_the_background(model, scene, tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     look = replace(model.own_look(), background=WHITE)
     empty = model.gaussians.map(lambda value: value[:0])
-    film.write_film(empty, look, film.through_views(scene.train.cameras, 3), tmp_path / "a.mp4")
+    film.write_film(empty, look, film.film_cameras("views", scene, 0.05), tmp_path / "a.mp4")
     _, frame, *_ = ffmpeg.read_frames(str(tmp_path / "a.mp4"))
     assert np.frombuffer(frame, dtype=np.uint8).min() > 250
 
 
-@pytest.mark.parametrize("path", ["orbit", "views"])
+@pytest.mark.parametrize("path", ["orbit", "views", "file"])
 def test_a_film(turbogs, finished, tmp_path, path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    if path == "file":
+        content = {"w": 33, "h": 24, "fl_x": 30.0, "frames": [{"transform_matrix": np.eye(4).tolist()}] * 2}
+        (tmp_path / "path.json").write_text(json.dumps(content))
+        path = tmp_path / "path.json"
     video = tmp_path / "a.mp4"
     code, out, err = turbogs("render", finished, "--path", path, "--out", video, "--seconds", "0.1", "--device", "cpu")
     assert code == 0 and str(video) in out, err
     reader = ffmpeg.read_frames(str(video))
     facts = next(reader)
-    assert facts["fps"] == 60 and facts["size"] == (48, 40)
+    assert facts["fps"] == 60 and facts["size"] == ((32, 24) if path not in ("orbit", "views") else (48, 40))
     frames = [np.frombuffer(frame, dtype=np.uint8) for frame in reader]
     assert len(frames) == 6
     if path == "views":

@@ -58,7 +58,7 @@ def render(
     split: Literal["test", "train"] = "test",
     depth: bool = False,
     out: Annotated[Path | None, arg(metavar="FOLDER|FILE")] = None,
-    path: Literal["orbit", "views"] | None = None,
+    path: Annotated[str | None, arg(metavar="orbit|views|FILE")] = None,
     seconds: Annotated[float | None, arg(metavar="SECONDS")] = None,
     device: Device = "auto",
     given: Given = NO_SCENE,
@@ -73,8 +73,8 @@ def render(
             nothing was hit) and .png (near is bright).
         out: folder for the pictures; renders in the run's folder where absent. With --path the new file of the film
             (.mp4).
-        path: write a film of 60 frames a second along a path: orbit, about what the capture shows; or views, through
-            its training cameras.
+        path: write a film of 60 frames a second along a path: orbit, about what the capture shows; views, through its
+            training cameras; or a file of cameras in the layout of transforms.json.
         seconds: of the film; 10 where absent.
         device: where to render.
     """

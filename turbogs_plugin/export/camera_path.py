@@ -1,12 +1,18 @@
-"""Paths of cameras for films: an orbit about the capture's subject, or a way through its cameras."""
+"""Paths of cameras for films: an orbit about the capture's subject, a way through its cameras, or a file's cameras."""
 
 from __future__ import annotations
 
 import math
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
 
+from turbogs_plugin.captures.camera_json import number_of, opengl_viewmat, pinhole, read_frames
+from turbogs_plugin.captures.capture import LARGEST_SIDE
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.geometry import camera_centers, evenly, look_at
 from turbogs_plugin.types import Cameras
 
@@ -15,7 +21,7 @@ MOST_KEYS = 24
 SWING = math.pi
 """Largest gap in radians between cameras that surround what they look at; beyond it an orbit swings."""
 WIDEST_FILM = 1920
-"""Pixels of a film's longer side, at most."""
+"""Pixels of the longer side of a film from the capture's cameras; a file's cameras have their own size."""
 
 
 def focus_and_up(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
@@ -74,6 +80,29 @@ def through_views(cameras: Cameras, frames: int) -> Cameras:
     keys = cameras.to("cpu").select(chosen)
     K, size = _common_lens(cameras)
     return interpolated(keys.viewmats.double().numpy(), K, size, frames)
+
+
+def from_file(path: Path, frame: Frame, frames: int) -> Cameras:
+    """A smooth way through the cameras of a file in the layout of ``transforms.json``: ``w``, ``h``, ``fl_x`` (or
+    ``camera_angle_x``), ``frames`` with a ``transform_matrix`` each, from camera to world, in the capture's own
+    coordinates and OpenGL's axes. Focal length and size are of the whole film.
+
+    Raises:
+        InputError: no such file, or not such a one.
+    """
+    content, entries = read_frames(path)
+    number = partial(number_of, content, path)
+    width, height = (number(name) for name in ("w", "h"))
+    if not (width and height and 2 <= width <= LARGEST_SIDE and 2 <= height <= LARGEST_SIDE):
+        raise InputError(f"{path} has no size of the film: give w and h in pixels")
+    K = pinhole(content, path, (width, height), angles="x")
+    if K is None or K[0, 0] <= 0:
+        raise InputError(f"{path} has neither fl_x nor a camera_angle_x in 0 .. pi")
+    viewmats = [
+        opengl_viewmat(entry.get("transform_matrix"), f"{path}: the transform_matrix of camera {place}")
+        for place, entry in enumerate(entries)
+    ]
+    return interpolated(frame.normalise_poses(np.stack(viewmats)), K, (round(width), round(height)), frames)
 
 
 def interpolated(viewmats: np.ndarray, K: np.ndarray, size: tuple[int, int], frames: int) -> Cameras:

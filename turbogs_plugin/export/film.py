@@ -11,16 +11,17 @@ import numpy as np
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.export.camera_path import orbit, through_views
+from turbogs_plugin.export.camera_path import from_file, orbit, through_views
 from turbogs_plugin.files import require_new_file, require_writable
 from turbogs_plugin.report.evaluation import open_saved
 from turbogs_plugin.report.images import to_uint8
+from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.look import Look
 from turbogs_plugin.types import Cameras, Gaussians
 
 RATE = 60
 """Frames a second."""
-PATHS = {"orbit": orbit, "views": through_views}
+PATHS = ("orbit", "views")
 SUFFIXES = (".mp4", ".mkv", ".mov")
 CODEC = "libx264"
 """Encoder of H.264, which all of these files hold; imageio-ffmpeg would try others first."""
@@ -36,7 +37,7 @@ def film_run(
 
     Args:
         path: folder of the run, or the file of a model.
-        camera_path: one of `PATHS`.
+        camera_path: orbit, views, or a file of cameras.
         video: new file.
         seconds: length of the film.
         device_name: where to render.
@@ -45,18 +46,32 @@ def film_run(
     Raises:
         InputError: an option does not fit, no such model, or no usable capture.
     """
+    require_film(camera_path, video, seconds)
+    model, scene = open_saved(path, device_name, given)
+    write_film(model.gaussians, model.own_look(scene.train), film_cameras(camera_path, scene, seconds), video)
+    return video
+
+
+def require_film(path: str, video: Path, seconds: float) -> None:
+    """Raise `InputError`, before anything is loaded, where a film cannot be made."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise InputError(f"a film needs imageio-ffmpeg: {INSTALL}")
     if not 0 < seconds <= 3600:
         raise InputError(f"--seconds {seconds:g}: it must be more than 0 and at most 3600")
+    if path not in PATHS and not Path(path).is_file():
+        raise InputError(f"--path '{path}': it must be orbit, views, or a file of cameras")
     if video.suffix.lower() not in SUFFIXES:
         raise InputError(f"--out '{video}': a film needs a new file that ends in {', '.join(SUFFIXES)}")
     require_new_file(video, "--out")
     require_writable(video.parent, f"--out '{video}'")
-    model, scene = open_saved(path, device_name, given)
-    cameras = PATHS[camera_path](scene.train.cameras, max(1, round(RATE * seconds)))
-    write_film(model.gaussians, model.own_look(scene.train), cameras, video)
-    return video
+
+
+def film_cameras(path: str, scene: Scene, seconds: float) -> Cameras:
+    """The cameras of a film's frames, in the scene's frame."""
+    frames = max(1, round(RATE * seconds))
+    if path not in PATHS:
+        return from_file(Path(path), scene.frame, frames)
+    return (orbit if path == "orbit" else through_views)(scene.train.cameras, frames)
 
 
 def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) -> None:
