@@ -17,7 +17,6 @@ from turbogs_plugin import engine
 from turbogs_plugin.engine import layout
 from turbogs_plugin.engine.cuda import launches, library, raster
 from turbogs_plugin.engine.cuda.training import view_rows
-from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.rules import LossTerms, ParameterRates
@@ -33,7 +32,6 @@ OBJECTS = {
     "Rates": ParameterRates,
     "SampleArrays": PixelSamples,
     "LossSettings": LossTerms,
-    "ExposureArrays": Exposures,
 }
 """What stands for the protocols of `launches`."""
 

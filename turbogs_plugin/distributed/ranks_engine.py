@@ -83,8 +83,7 @@ class RanksEngine:
         self, engine: SharedEngine, ranks: ProcessRanks, device: torch.device, share: Sharing = share_memory
     ) -> None:
         self.engine, self.ranks, self.device = engine, ranks, device
-        self.draw, self.expose, self.learn_exposures = engine.draw, engine.expose, engine.learn_exposures
-        self.evaluate, self.learn = engine.evaluate, engine.learn
+        self.draw, self.evaluate, self.learn = engine.draw, engine.evaluate, engine.learn
         self.evaluate_and_learn, self.supervise = engine.evaluate_and_learn, engine.supervise
         self.in_place = True
         self.memory, self.messages = InPlace(ranks, share), Messages(ranks)

@@ -14,7 +14,6 @@ from typing import Any, Protocol
 import numpy as np
 from torch import Tensor
 
-from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
@@ -132,26 +131,6 @@ class Engine(Protocol):
 
     def supervise(self, terms: LossTerms, colors: Tensor, truth: GroundTruth, update: MapUpdate) -> LossOutput:
         """`evaluate` against the photos at the samples, then `learn`. `colors`: [P, 3], on the engine's device."""
-
-    def expose(self, exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
-        """[P, 3] float32: rendered colours [P, 3] as the exposure of each sample's photo shows them."""
-
-    def learn_exposures(
-        self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
-    ) -> Tensor:
-        """Take gradients back through `expose`, and make one step of Adam with the exposures of the batch.
-
-        A skipped iteration changes no exposure.
-
-        Args:
-            exposures: those that the colours were exposed with; changed in place.
-            colors: [P, 3], as given to `expose`.
-            gradients: [P, 3], d loss / d exposed colours; it cannot be used again.
-            rate: Adam's.
-
-        Returns:
-            [P, 3] float32, d loss / d colours.
-        """
 
     def update(
         self,

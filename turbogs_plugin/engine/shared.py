@@ -15,11 +15,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.layout import PassStatus
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import Engine, GroundTruth, MapUpdate
-from turbogs_plugin.engine.reference.exposed_colors import expose, exposure_gradients, step_exposures
 from turbogs_plugin.engine.reference.records import collect_records, gather_colors
 from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients, ScreenRecords
@@ -108,16 +106,6 @@ class SharedEngine(Engine):
         update.maps.update(samples, torch.where(drawn, output.pixel_errors, torch.nan), update.step)
         if update.nonfinite_losses is not None:
             update.nonfinite_losses.add_(nonfinite)
-
-    def expose(self, exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
-        return expose(exposures, colors, samples)
-
-    def learn_exposures(
-        self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
-    ) -> Tensor:
-        of_colors, sums = exposure_gradients(exposures, colors, gradients, samples)
-        step_exposures(exposures, sums, samples.view_ids, rate, self.overflow)
-        return of_colors
 
     def update(
         self,

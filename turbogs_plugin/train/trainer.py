@@ -15,7 +15,7 @@ from torch import Tensor
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine, engine_of
-from turbogs_plugin.engine.exposures import exposure_rate
+from turbogs_plugin.engine.exposures import exposure_rate, learn_exposures
 from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import Dropout
@@ -139,7 +139,7 @@ class Trainer(TrainingState):
         if self.exposures is None:
             return loss
         rate, gradients = exposure_rate(step), loss.color_gradients
-        gradients = self.engine.learn_exposures(self.exposures, colors, gradients, samples=samples, rate=rate)
+        gradients = learn_exposures(self.exposures, colors, gradients, samples, rate, self.engine.overflow)
         return replace(loss, color_gradients=gradients)
 
     def update(self, screen: ScreenGradients, stats: GaussianStats | None, step: Step) -> None:

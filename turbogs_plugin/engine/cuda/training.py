@@ -1,7 +1,7 @@
-"""Python functions for the training kernels: sampling, loss, projection backward with the optimizer's step, exposures.
+"""Python functions for the training kernels: sampling, loss, projection backward with the optimizer's step.
 
 Each function does what its torch twin in `engine.reference` defines: `draws.draw_pixels`, `losses.sparse_loss` with
-`ErrorMaps.update`, `raster.ReferenceScreenGradients.parameter_gradients` with `update.apply_update`, `exposed_colors`.
+`ErrorMaps.update`, `raster.ReferenceScreenGradients.parameter_gradients` with `update.apply_update`.
 It is enqueued on torch's current stream and does not wait. Tensors must be contiguous. A wrong device, dtype or shape
 raises `RuntimeError`, which names the tensor and what was expected; more views than the kernels accept raise
 `InputError`.
@@ -21,7 +21,6 @@ from torch import Tensor
 from turbogs_plugin.engine.cuda import launches, library
 from turbogs_plugin.engine.cuda.raster import CudaScreenGradients, count_filled, plain_floats, require_views
 from turbogs_plugin.engine.cuda.workspace import Workspace
-from turbogs_plugin.engine.exposures import BETA1, BETA2, EPSILON, PULL, Exposures
 from turbogs_plugin.engine.layout import MAX_PEERS, SAMPLE_UNITS, STRUCTURES, UPDATE_KINDS
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import MapUpdate
@@ -303,63 +302,3 @@ def _copies(copies: ModelCopies | None) -> launches.Copies:
     if copies is None:
         return launches.NO_COPIES
     return launches.Copies(*copies.distances, *(0,) * (MAX_PEERS - 1 - len(copies.distances)))
-
-
-def expose_colors(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
-    """`Engine.expose`. `samples`: of at most `MAX_VIEWS` views."""
-    library.require()
-    colors = plain_floats(colors)
-    launch = launches.ExposeColors(
-        colors=colors,
-        tile_ids=samples.tile_ids,
-        tile_offsets=samples.tile_offsets,
-        views=_photo_rows(samples),
-        grid=launches.GridOrigin(*samples.origin),
-        offsets=exposures.offsets,
-        exposed=torch.empty_like(colors),
-    )
-    library.launch(launch)
-    return launch.exposed
-
-
-def learn_exposures(
-    exposures: Exposures,
-    colors: Tensor,
-    gradients: Tensor,
-    samples: PixelSamples,
-    rate: float,
-    overflow: Tensor | None = None,
-) -> Tensor:
-    """`Engine.learn_exposures`, in two launches; `gradients`, where float32 and contiguous, is changed in place."""
-    library.require()
-    rows, grid = _photo_rows(samples), launches.GridOrigin(*samples.origin)
-    backward = launches.ExposureBackward(
-        colors=plain_floats(colors),
-        tile_ids=samples.tile_ids,
-        tile_offsets=samples.tile_offsets,
-        views=rows,
-        grid=grid,
-        offsets=exposures.offsets,
-        gradients=plain_floats(gradients),
-        sums=torch.zeros(len(samples.view_ids), 3, 4, dtype=torch.float64, device=colors.device),
-    )
-    library.launch(backward)
-    library.launch(
-        launches.ExposureStep(
-            sums=backward.sums,
-            views=rows,
-            grid=grid,
-            exposures=exposures,
-            overflow=overflow,
-            rate=rate,
-            beta1=BETA1,
-            beta2=BETA2,
-            eps=EPSILON,
-            pull=PULL,
-        )
-    )
-    return backward.gradients
-
-
-def _photo_rows(samples: PixelSamples) -> list[int]:
-    return view_rows([0] * len(samples.view_ids), samples.sizes.tolist(), samples.view_ids)
