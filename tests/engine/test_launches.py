@@ -19,6 +19,7 @@ from turbogs_plugin.engine.cuda import launches, library, raster
 from turbogs_plugin.engine.cuda.training import view_rows
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
+from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS
 from turbogs_plugin.engine.rules import LossTerms, ParameterRates
 from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, PixelSamples
 
@@ -170,7 +171,7 @@ def test_rows_of_views_are_what_the_layout_says():
 def test_selected_cameras_are_read_from_the_memory_of_all():
     """Nothing is stacked for a launch, which names the row of each view's camera."""
     cameras, gaussians = make_cameras([(40, 30), (20, 21), (30, 50)], torch.float32), make_gaussians(4)
-    scene = raster._scene(gaussians, cameras.select([2, 0]), sh_degree=1, eps2d=0.3)
+    scene = raster.scene_of(gaussians, cameras.select([2, 0]), DEFAULT_OPTIONS)
     assert scene.viewmats.data_ptr() == cameras.viewmats.data_ptr() and scene.viewmats.shape == (3, 4, 4)
     assert scene.Ks.data_ptr() == cameras.Ks.data_ptr() and scene.images == [30, 50, 2, 40, 30, 0]
     assert len(scene.images) == 2 * layout.ImageRow.SIZE and scene.images[layout.ImageRow.CAMERA] == 2
@@ -184,7 +185,7 @@ def loaded(monkeypatch, tmp_path):
     monkeypatch.setenv(library.LIBRARY_VARIABLE, str(path))
     monkeypatch.setattr(torch.ops, "load_library", lambda path: None)
     library._load_failure.cache_clear()
-    yield lambda text: monkeypatch.setattr(library, "_interface", lambda: text)
+    yield lambda text: monkeypatch.setattr(torch.ops.turbogs, "interface", lambda: text, raising=False)
     library._load_failure.cache_clear()
 
 

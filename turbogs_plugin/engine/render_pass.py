@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
@@ -66,6 +67,8 @@ class ScreenGradients(Protocol):
 
     def full_records(self) -> Tensor:
         """[K, N, 16] the gradients on the screen, `layout.ScreenRecord`; zero where a Gaussian is not drawn."""
+        plain = self.plain()
+        return torch.where((plain.radii > 0).any(dim=-1, keepdim=True), plain.records, 0.0)
 
     def plain(self) -> ScreenRecords:
         """Plain tensors; the inverse of `Engine.screen_gradients`."""
@@ -128,7 +131,7 @@ class Rendered(ABC):
             alpha_gradients, depth_gradients: [P], where the loss has such terms.
 
         Raises:
-            InputError: on CUDA, depth gradients for a pass without depths, or a tensor of wrong shape, dtype or device.
+            RuntimeError: on CUDA, depth gradients for a pass without depths, or a tensor of wrong shape or dtype.
         """
         return self._backward(
             Upstream(color_gradients, alpha_gradients, depth_gradients, pixel_errors), with_statistics

@@ -13,7 +13,8 @@ from turbogs_plugin.engine.cuda.raster import (
     CudaRendered,
     CudaScreenGradients,
     rasterize_cuda,
-    screen_gradients,
+    ready,
+    scene_of,
 )
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
@@ -55,7 +56,8 @@ class CudaEngine(SharedEngine):
         options: RenderOptions,
         plain: ScreenRecords,
     ) -> CudaScreenGradients:
-        return screen_gradients(gaussians, cameras, samples, options, plain, self.workspace)
+        scene = scene_of(ready(gaussians), cameras, options)
+        return CudaScreenGradients(scene, samples, plain.records, plain.radii, plain.with_statistics, self.overflow)
 
     def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
         arrays = [array for source in sources for array in (source.records, source.radii)]

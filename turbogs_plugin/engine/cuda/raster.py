@@ -8,7 +8,7 @@ tiles and splats; with one it never waits (see `workspace.py`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -25,6 +25,7 @@ from turbogs_plugin.engine.render_pass import (
     Projected,
     Rendered,
     RenderOptions,
+    ScreenGradients,
     ScreenRecords,
     Upstream,
     require_statistics,
@@ -40,43 +41,14 @@ def plain_floats(tensor: Tensor) -> Tensor:
     return tensor.contiguous()
 
 
-def _prepared(tensor: Tensor) -> Tensor:
-    """`plain_floats`, aligned for 16-byte loads."""
-    tensor = plain_floats(tensor)
-    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
+def ready(gaussians: Gaussians) -> Gaussians:
+    """The model as kernels take it: `plain_floats` that are aligned for 16-byte loads; the given one where it is so."""
 
+    def prepared(value: Tensor) -> Tensor:
+        value = plain_floats(value)
+        return value if value.data_ptr() % 16 == 0 else value.clone()
 
-def _check(gaussians: Gaussians) -> None:
-    if gaussians.device.type != "cuda":
-        raise InputError(f"rasterize_cuda: the Gaussians are on {gaussians.device}; move them to a CUDA device")
-    _require(gaussians.items(), torch.float32, gaussians.device)
-
-
-def _check_batch(cameras: Cameras, samples: PixelSamples, device: torch.device) -> None:
-    viewmats, Ks, _ = cameras.by_row()
-    _require((("cameras.viewmats", viewmats), ("cameras.Ks", Ks)), torch.float32, device)
-    integers = ((f"samples.{name}", getattr(samples, name)) for name in ("pixel_ids", "tile_ids", "tile_offsets"))
-    _require(integers, torch.int32, device)
-    require_views(len(cameras))
-    if cameras.sizes.tolist() != samples.sizes.tolist():
-        raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
-
-
-def _require(tensors: Iterable[tuple[str, Tensor]], dtype: torch.dtype, device: torch.device) -> None:
-    for name, tensor in tensors:
-        if tensor.dtype != dtype or tensor.device != device:
-            raise InputError(f"{name} must be {dtype} on {device}, got {tensor.dtype} on {tensor.device}")
-
-
-def _ready(gaussians: Gaussians, workspace: Workspace | None) -> Gaussians:
-    """The model as kernels take it; with a workspace a model is checked once, not at each pass."""
-    if workspace is not None and workspace.knows(gaussians):
-        return gaussians
-    _check(gaussians)
-    ready = gaussians.map(_prepared)
-    if workspace is not None and all(value is getattr(gaussians, name) for name, value in ready.items()):
-        workspace.know(gaussians)
-    return ready
+    return gaussians if all(prepared(value) is value for _, value in gaussians.items()) else gaussians.map(prepared)
 
 
 def warps_per_tile(slots: int, tiles: int) -> int:
@@ -85,7 +57,7 @@ def warps_per_tile(slots: int, tiles: int) -> int:
 
 
 @dataclass
-class CudaScreenGradients:
+class CudaScreenGradients(ScreenGradients):
     """Gradients on the screen (see `ScreenGradients`), and what is needed to take them to the parameters.
 
     Args:
@@ -104,19 +76,11 @@ class CudaScreenGradients:
     with_statistics: bool = False
     overflow: Tensor | None = None
 
-    def full_records(self) -> Tensor:
-        """[K, N, 16] the records, zero where a Gaussian is off screen."""
-        return torch.where((self.radii > 0).any(dim=-1, keepdim=True), self.records, 0.0)
-
     def plain(self) -> ScreenRecords:
         return ScreenRecords(self.records, self.radii, self.with_statistics)
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
-        """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once.
-
-        The fields that have rows are views of one packed [K, N, 14] tensor. After an overflow they are zero.
-        """
-        library.require()
+        # The fields that have rows are views of one packed [K, N, 14] tensor. After an overflow they are zero.
         gaussians = self.scene.gaussians
         shape = (len(self.records) if rows else 1, len(gaussians))
         # The kernel writes every entry, unless an overflow keeps it from running.
@@ -133,7 +97,6 @@ class CudaScreenGradients:
 
     def backward_arguments(self, stats: GaussianStats | None) -> launches.ScreenBackward:
         """The arguments shared by the launches that take these gradients to the parameters."""
-        require_views(len(self.records))
         require_statistics(self.with_statistics, stats)
         return launches.ScreenBackward(
             scene=self.scene,
@@ -153,12 +116,6 @@ def count_filled(samples: PixelSamples) -> Tensor | None:
     if samples.num_filled is None:
         samples.num_filled = (samples.pixel_ids >= 0).sum(dtype=torch.int32).reshape(1)
     return samples.num_filled
-
-
-def require_views(count: int) -> None:
-    """Raise `InputError` if a batch has no view, or more than the kernels accept."""
-    if not 1 <= count <= layout.MAX_VIEWS:
-        raise InputError(f"a batch takes 1 .. {layout.MAX_VIEWS} views, got {count}")
 
 
 @dataclass
@@ -187,13 +144,6 @@ class CudaRendered(Rendered):
         )
 
     def _backward(self, upstream: Upstream, with_statistics: bool) -> CudaScreenGradients:
-        if upstream.depth_gradients is not None and self.depths is None:
-            raise InputError("depth_gradients need a pass with depths: rasterize(..., with_depth=True)")
-        for name, value in vars(upstream).items():
-            like = self.colors if name == "color_gradients" else self.alphas
-            if value is not None and (value.shape, value.dtype, value.device) != (like.shape, like.dtype, like.device):
-                wanted = f"float32 {list(like.shape)} on {like.device}"
-                raise InputError(f"{name} must be {wanted}, got {value.dtype} {list(value.shape)} on {value.device}")
         buffers = Buffers(self._workspace, self.colors.device)
         records = buffers.floats("records", len(self._forward.instances), ScreenRecord.SIZE)
         if not self._cleared:
@@ -205,30 +155,16 @@ class CudaRendered(Rendered):
         return CudaScreenGradients(self._scene, self._samples, records, self._radii, with_statistics, overflow)
 
 
-def screen_gradients(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    samples: PixelSamples,
-    options: RenderOptions,
-    plain: ScreenRecords,
-    workspace: Workspace | None = None,
-) -> CudaScreenGradients:
-    """`Engine.screen_gradients`. The Gaussians are contiguous, and their rows begin at a multiple of four."""
-    library.require()
-    scene = _scene(_ready(gaussians, workspace), cameras, options.used_degree(gaussians), options.settings.eps2d)
-    overflow = None if workspace is None else workspace.overflow
-    return CudaScreenGradients(scene, samples, plain.records, plain.radii, plain.with_statistics, overflow)
-
-
-def _scene(gaussians: Gaussians, cameras: Cameras, sh_degree: int, eps2d: float) -> launches.Scene:
+def scene_of(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> launches.Scene:
+    """What a pass draws, of Gaussians that are `ready`."""
     viewmats, Ks, rows = cameras.by_row()
     return launches.Scene(
         gaussians=gaussians,
         viewmats=plain_floats(viewmats),
         Ks=plain_floats(Ks),
         images=[number for size, row in zip(cameras.sizes.tolist(), rows, strict=True) for number in (*size, row)],
-        sh_degree=sh_degree,
-        eps2d=eps2d,
+        sh_degree=options.used_degree(gaussians),
+        eps2d=options.settings.eps2d,
     )
 
 
@@ -319,13 +255,13 @@ def rasterize_cuda(
         workspace: memory to reuse, so that nothing waits for the GPU; `Workspace` says what the caller must then do.
 
     Raises:
-        InputError: no kernels here, a tensor of wrong dtype or device, or more intersections than a pass can have.
+        InputError: cameras of other image sizes than the samples', or more intersections than a pass can have.
+        RuntimeError: a tensor of wrong shape, dtype or device; the message names it.
     """
-    library.require()
-    degree, settings = options.used_degree(gaussians), options.settings
-    gaussians = _ready(gaussians, workspace)
-    device = gaussians.device
-    _check_batch(cameras, samples, device)
+    if cameras.sizes.tolist() != samples.sizes.tolist():
+        raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
+    scene = scene_of(ready(gaussians), cameras, options)
+    settings, device = options.settings, gaussians.device
     buffers = Buffers(workspace, device)
     views, count, slots = len(cameras), len(gaussians), len(samples)
     num_tiles, num_active = len(samples.grid), len(samples.tile_ids)
@@ -333,7 +269,6 @@ def rasterize_cuda(
     # A pass over every tile needs no table of the active ones.
     everywhere = num_active == num_tiles
     tile_ids = None if everywhere else samples.tile_ids.contiguous()
-    scene = _scene(gaussians, cameras, degree, settings.eps2d)
     front = buffers.kept("front", _Front.of, views, count, num_active, num_tiles)
     splats, tiles = front.splats, front.tiles
     grid = launches.GridOrigin(*samples.origin)

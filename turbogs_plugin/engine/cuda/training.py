@@ -1,10 +1,9 @@
 """Python functions for the training kernels: sampling, loss, projection backward with the optimizer's step.
 
 Each function does what its torch twin in `engine.reference` defines: `draws.draw_pixels`, `losses.sparse_loss` with
-`ErrorMaps.update`, `raster.ReferenceScreenGradients.parameter_gradients` with `update.apply_update`.
-It is enqueued on torch's current stream and does not wait. Tensors must be contiguous. A wrong device, dtype or shape
-raises `RuntimeError`, which names the tensor and what was expected; more views than the kernels accept raise
-`InputError`.
+`ErrorMaps.update`, `raster.ReferenceScreenGradients.parameter_gradients` with `update.apply_update`. It is enqueued on
+torch's current stream and does not wait. Tensors must be contiguous. A wrong device, dtype or shape, or a batch without
+a view or with more than `MAX_VIEWS`, raises `RuntimeError`, which names the tensor and what was expected.
 """
 
 from __future__ import annotations
@@ -13,13 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate, pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.cuda import launches, library
-from turbogs_plugin.engine.cuda.raster import CudaScreenGradients, count_filled, plain_floats, require_views
+from turbogs_plugin.engine.cuda.raster import CudaScreenGradients, count_filled, plain_floats
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import MAX_PEERS, SAMPLE_UNITS, STRUCTURES, UPDATE_KINDS
 from turbogs_plugin.engine.moments import GaussianMoments
@@ -43,7 +43,6 @@ from turbogs_plugin.types import (
 
 def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
     """`Engine.draw`: sets equal to `draw_pixels`'s. `view_ids`: at most `MAX_VIEWS`."""
-    library.require()
     maps.fetch(view_ids)
     views = np.asarray(view_ids, dtype=np.int64)
     device, sizes = maps.errors.device, maps.sizes[views]
@@ -178,7 +177,6 @@ def view_rows(
     draws: Sequence[tuple[int, ...]] | None = None,
 ) -> list[int]:
     """A `layout.ViewRow` for each view (with `draws` a `layout.DrawRow`), end to end. `shapes`: (width, height)."""
-    require_views(len(view_ids))
     columns = zip(starts, shapes, view_ids, draws or [()] * len(view_ids), strict=True)
     return [number for start, size, view_id, draw in columns for number in (start, *size, view_id, *draw)]
 
@@ -210,7 +208,6 @@ def sparse_loss(
     Returns:
         The loss (a float64 scalar on the device), gradients [P, 3] float32 and errors [P] float32.
     """
-    library.require()
     colors = plain_floats(colors)
     photos = targets if targets.dtype == torch.uint8 else None
     maps, beta, stamp, nonfinite_losses = launches.NO_MAPS, 0.0, 0, None
@@ -272,7 +269,6 @@ def fused_step(
         moments: its optimizer state, float32.
         copies: of `gaussians`, `MAX_PEERS` - 1 at most.
     """
-    library.require()
     if not isinstance(screen, CudaScreenGradients):
         raise TypeError(f"fused_step: {type(screen).__name__} is not of a pass of the kernels")
     drawn = screen.scene.gaussians
@@ -298,7 +294,9 @@ def fused_step(
     )
 
 
-def _copies(copies: ModelCopies | None) -> launches.Copies:
+def _copies(copies: ModelCopies | None) -> SimpleNamespace:
+    """`launches.Copies`: a distance for each other process, 0 for those that are not there."""
     if copies is None:
         return launches.NO_COPIES
-    return launches.Copies(*copies.distances, *(0,) * (MAX_PEERS - 1 - len(copies.distances)))
+    distances = (*copies.distances, *(0,) * (MAX_PEERS - 1 - len(copies.distances)))
+    return SimpleNamespace(**{f"copy_{place}": distance for place, distance in enumerate(distances)})

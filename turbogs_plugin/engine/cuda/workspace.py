@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
-from weakref import ref
 
 import torch
 from torch import Tensor
@@ -23,7 +22,6 @@ from torch import Tensor
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX, PassStatus
 from turbogs_plugin.engine.shared import PassMemory
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import Gaussians
 
 Kept = TypeVar("Kept")
 
@@ -105,7 +103,6 @@ class Workspace:
         self._gaussians = 0
         self._intersections_per_tile = 0.0
         self._first_lost: int | None = None
-        self._known: dict[int, ref[Gaussians]] = {}  # by identity
 
     def _set_status(self, status: Tensor) -> None:
         self.status, self._overflow = status, status[PassStatus.OVERFLOW :]
@@ -152,16 +149,6 @@ class Workspace:
             if lent is not None:
                 self._buffers[name] = lent
         self._lent = memory
-
-    def know(self, gaussians: Gaussians) -> None:
-        """Remember that this model's tensors are as kernels take them, as long as it lives."""
-        self._known = {place: known for place, known in self._known.items() if known() is not None}
-        self._known[id(gaussians)] = ref(gaussians)
-
-    def knows(self, gaussians: Gaussians) -> bool:
-        """Whether a model is remembered: its tensors need no look at each pass, as operators look at them, too."""
-        known = self._known.get(id(gaussians))
-        return known is not None and known() is gaussians
 
     def kept(self, name: str, sizes: tuple, make: Callable[[], Kept]) -> Kept:
         """Result of `make`, made anew only where `sizes` differ from the last call of this name.

@@ -18,6 +18,7 @@ from turbogs_plugin.engine.render_pass import (
     Projected,
     Rendered,
     RenderOptions,
+    ScreenGradients,
     ScreenRecords,
     Upstream,
     require_statistics,
@@ -27,7 +28,7 @@ from turbogs_plugin.types import PARAMETER_NAMES, Cameras, GaussianGradients, Ga
 
 
 @dataclass
-class ReferenceScreenGradients:
+class ReferenceScreenGradients(ScreenGradients):
     """Gradients on the screen (see `ScreenGradients`).
 
     Args:
@@ -46,15 +47,12 @@ class ReferenceScreenGradients:
     samples: PixelSamples
     with_statistics: bool = False
 
-    def full_records(self) -> Tensor:
-        """[K, N, 16], zero where a Gaussian is not drawn."""
-        return self.rows.scatter(self.records)
-
     def plain(self) -> ScreenRecords:
-        return ScreenRecords(self.full_records(), self.rows.scatter(self.splats.radii), self.with_statistics)
+        return ScreenRecords(
+            self.rows.scatter(self.records), self.rows.scatter(self.splats.radii), self.with_statistics
+        )
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
-        """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
         require_statistics(self.with_statistics, stats)
         records, splats = self.records, self.splats
         outputs = (splats.means2d, splats.conics, splats.colors, splats.opacities, splats.depths)

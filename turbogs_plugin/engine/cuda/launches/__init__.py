@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 from .base import LAUNCHES, Launch, field_types, fields_of, nested_type
 
 if TYPE_CHECKING:
+    from types import SimpleNamespace as Copies
+
     from torch import Tensor
 
     from turbogs_plugin.engine.moments import GaussianMoments as Moments
@@ -44,6 +46,7 @@ else:  # the fields that launches read of these
     DropoutWords = fields_of(int="threshold seed iteration")
     Upstream = fields_of(Tensor="color_gradients alpha_gradients depth_gradients pixel_errors")
     Moments = fields_of(Tensor="exp_avg exp_avg_sq exp_avg_shN exp_avg_sq_shN steps skipped")
+    Copies = fields_of(int="copy_0 copy_1 copy_2 copy_3 copy_4 copy_5 copy_6")
     Rates = fields_of(float="means quats scales opacities sh0 shN")
     MaskArrays = fields_of(Tensor="tiles rows bits")  # [L] int32, [L] int32, [B, 8] int32
     LossSettings = fields_of(float="epsilon l1_weight structure_weight variance_constant", bool="balance")
@@ -51,10 +54,11 @@ else:  # the fields that launches read of these
 
 __all__ = ["LAUNCHES", "Launch", "field_types", "nested_type"]
 
+NO_COPIES: Any = SimpleNamespace(**dict.fromkeys(Copies.__annotations__, 0))
 NO_STATS: Any = SimpleNamespace(**dict.fromkeys(StatSums.__annotations__))
 NO_MASKS: Any = SimpleNamespace(**dict.fromkeys(MaskArrays.__annotations__))
 NO_MAPS: Any = SimpleNamespace(**dict.fromkeys(MapArrays.__annotations__))
-"""Arguments of a launch that adds to no statistics, counts every pixel, updates no maps."""
+"""Arguments of a launch that changes no copies, adds to no statistics, counts every pixel, updates no maps."""
 
 
 @dataclass
@@ -212,28 +216,12 @@ class ProjectionBackward(Launch):
 
 
 @dataclass
-class Copies:
-    """How many bytes behind each parameter a copy of it lies, maybe in another GPU's memory; 0: no copy."""
-
-    copy_0: int
-    copy_1: int
-    copy_2: int
-    copy_3: int
-    copy_4: int
-    copy_5: int
-    copy_6: int
-
-
-NO_COPIES = Copies(*(0,) * 7)
-
-
-@dataclass
 class FusedStep(Launch):
     """Projection backward and one step of the optimizer, in place on Gaussians and moments, and on copies of the
     Gaussians."""
 
     screen: ScreenBackward
-    copies: Copies
+    copies: Copies  # bytes from each parameter to a copy of it, maybe in another GPU's memory; 0: no copy
     moments: Moments
     kind: int  # of layout.UPDATE_KINDS
     rows_per_view: bool
