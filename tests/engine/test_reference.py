@@ -8,12 +8,12 @@ from helpers.gsplat_torch import gsplat_torch_render
 from helpers.rendering_scenes import dense_on_grid, loop_render, make_cameras, make_gaussians, thin_out
 from torch.autograd.function import once_differentiable
 
-from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference import compositing, projection
 from turbogs_plugin.engine.render import dense_samples, rasterize, render_image
-from turbogs_plugin.engine.render_pass import ALPHA_MIN_LOWEST, RasterSettings
+from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, PixelSamples, sample_order
 
 SIZES = [(37, 29), (20, 50)]
@@ -347,7 +347,7 @@ def test_settings_are_used():
     gaussians, cameras = make_gaussians(40), make_cameras([(24, 24)])
     samples = dense_samples(cameras)
     colors = gsplat_colors(gaussians, cameras)
-    settings = RasterSettings(eps2d=1.0, near_plane=3.5, far_plane=5.0, alpha_min=0.02, alpha_max=0.5)
+    settings = RasterSettings(eps2d=1.0, near_plane=3.5, far_plane=5.0)
     expected = loop_render(gaussians, cameras, samples, colors, np.zeros(len(samples)), settings)
     rendered = rasterize(gaussians, cameras, samples, settings=settings)
     np.testing.assert_allclose(rendered.colors, expected.colors, atol=1e-13)
@@ -362,9 +362,6 @@ def test_settings_are_used():
         {"near_plane": np.nan},
         {"near_plane": 2.0, "far_plane": 2.0},
         {"far_plane": np.nan},
-        {"alpha_min": 0.0039},
-        {"alpha_min": 0.5, "alpha_max": 0.5},
-        {"alpha_max": 1.0},
         {"transmittance_min": 0.0},
         {"transmittance_min": 1.0},
     ],
@@ -373,13 +370,6 @@ def test_settings_are_used():
 def test_settings_out_of_bounds_are_refused(values):
     with pytest.raises(InputError, match=f"{list(values)[-1]} = "):
         RasterSettings(**values)
-
-
-def test_settings_of_gsplat_are_taken():
-    """Its defaults, and bounds that are allowed themselves."""
-    RasterSettings(eps2d=0.3, near_plane=0.01, far_plane=1e10, alpha_min=1 / 255, alpha_max=0.99)
-    RasterSettings(eps2d=0.0, far_plane=np.inf, alpha_min=ALPHA_MIN_LOWEST)
-    assert pytest.approx(projection.EXTENT_MAX) == (-2 * np.log(ALPHA_MIN_LOWEST)) ** 0.5
 
 
 def test_dense_samples_are_every_pixel_in_sample_order():

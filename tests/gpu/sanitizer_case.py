@@ -18,11 +18,11 @@ from helpers.raster_cases import samples_to
 from helpers.rendering_scenes import make_cameras, make_gaussians, one_tile_of_a_wide_image, stacked_splats
 
 from turbogs_plugin.captures import load_scene, write_demo_capture
-from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.cuda.engine import CudaEngine
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.engine.render_pass import ScreenRecords
+from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import GaussianStats

@@ -6,10 +6,10 @@ import torch
 from helpers.raster_cases import GPU_ONLY, assert_gradients_close, make_case
 from helpers.rendering_scenes import thin_out
 
-from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.engine.render_pass import RenderOptions
+from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
 
 pytestmark = GPU_ONLY
 SIZE = (250, 170)

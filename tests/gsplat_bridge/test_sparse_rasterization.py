@@ -9,11 +9,11 @@ import torch
 from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats
 from helpers.gsplat_torch import gsplat_torch_render
 
-from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_loss, sparse_rasterization
+from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, screen_statistics
 from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
 from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler

@@ -7,8 +7,6 @@ package chooses between the kernels and torch.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 
@@ -18,27 +16,7 @@ from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.shared import SharedEngine
 
-__all__ = ["CompiledKernels", "Engine", "compiled_kernels", "engine_of"]
-
-
-@dataclass(frozen=True)
-class CompiledKernels:
-    """The compiled library of kernels, for reports.
-
-    Args:
-        path: where it is expected.
-        architectures: those it holds code for: ``sm_90``, ..., or PTX, ``compute_90``.
-        unavailable: why it cannot run here, in one line; "" if it can.
-    """
-
-    path: Path
-    architectures: tuple[str, ...]
-    unavailable: str
-
-
-def compiled_kernels() -> CompiledKernels:
-    """The library that `engine_of` uses for CUDA tensors, or why it uses the reference instead."""
-    return CompiledKernels(library.library_path(), library.architectures(), library.unavailable_reason())
+__all__ = ["Engine", "engine_of", "library"]
 
 
 def engine_of(device: torch.device, for_training: bool = False) -> SharedEngine:

@@ -7,23 +7,21 @@ and its step may change their copies of the model too (`ModelCopies`).
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
-import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import PassStatus
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.protocol import Engine, GroundTruth, MapUpdate
+from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.reference.records import collect_records, gather_colors
 from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients, ScreenRecords
-from turbogs_plugin.engine.rules import LossTerms, UpdateRule
+from turbogs_plugin.engine.rules import UpdateRule
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate
+from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples
 
 
 @dataclass
@@ -81,32 +79,6 @@ class SharedEngine(Engine):
     """An engine on one device, without what each engine does in its own way: draw, render, evaluate, go back from the
     screen (`screen_gradients`), and recover. Passes and steps can be put together with other engines' of its kind."""
 
-    @property
-    def overflow(self) -> Tensor | None:
-        return None
-
-    @property
-    def bytes_held(self) -> int:
-        return 0
-
-    def supervise(self, terms: LossTerms, colors: Tensor, truth: GroundTruth, update: MapUpdate) -> LossOutput:
-        return self.evaluate_and_learn(terms, colors, truth.colors(), truth.samples, update)
-
-    def evaluate_and_learn(
-        self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
-    ) -> LossOutput:
-        output = self.evaluate(terms, colors, targets, samples)
-        self.learn(samples, colors, output, update)
-        return output
-
-    def learn(self, samples: PixelSamples, colors: Tensor, output: LossOutput, update: MapUpdate) -> None:
-        drawn, nonfinite = torch.isfinite(colors).all(dim=1), ~output.loss.isfinite()
-        if self.overflow is not None:
-            drawn, nonfinite = drawn & (self.overflow == 0), nonfinite & (self.overflow[0] == 0)
-        update.maps.update(samples, torch.where(drawn, output.pixel_errors, torch.nan), update.step)
-        if update.nonfinite_losses is not None:
-            update.nonfinite_losses.add_(nonfinite)
-
     def update(
         self,
         rule: UpdateRule,
@@ -121,24 +93,6 @@ class SharedEngine(Engine):
         for copy in copies.copies if copies else ():
             for name, value in copy.items():
                 value.copy_(getattr(gaussians, name))
-
-    def settle(self, wait: bool = False) -> int:
-        return 0
-
-    def place(self, gaussians: Gaussians) -> Gaussians:
-        return gaussians
-
-    def each_view(self, errors_of: Callable[[int], Tensor], pixels: Sequence[int]) -> Iterator[Tensor]:
-        return map(errors_of, range(len(pixels)))
-
-    def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
-        """Every row is always valid here."""
-
-    def agreed(self, update: RowUpdate | None) -> RowUpdate | None:
-        return update
-
-    def verify(self, state: Callable[[], dict[str, Any]]) -> None:
-        """There is one state."""
 
     def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
         """Collect the records of all K views for some rows. What several processes have of one view is added up, in

@@ -16,13 +16,14 @@ from torch import Tensor
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine, engine_of
 from turbogs_plugin.engine.exposures import exposure_rate, learn_exposures
-from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
+from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import Dropout
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.limits import RESTRAIN_EVERY, Clearance, restrain_distant
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.train.training_state import TrainingState
 from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
@@ -123,7 +124,7 @@ class Trainer(TrainingState):
         if self.parameter_mean is not None and self.parameter_mean.due(self.iteration, self.iterations):
             self.parameter_mean.add(self.learnt())
 
-    def supervise(self, colors: Tensor, truth: GroundTruth, step: Step) -> LossOutput:
+    def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
         """Loss and error maps, and the exposures of the photos where they are learnt.
 
         Loss and maps are one step if the loss is a rule, else the loss's own code comes first.

@@ -17,10 +17,11 @@ from turbogs_plugin.engine.cuda.raster import (
     scene_of,
 )
 from turbogs_plugin.engine.cuda.workspace import Workspace
-from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
+from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, RenderOptions, ScreenRecords
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.engine.shared import PassMemory, SharedEngine
+from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.types import BLACK, Cameras, Gaussians, LossOutput, PixelSamples
 
 
@@ -78,7 +79,7 @@ class CudaEngine(SharedEngine):
         library.launch(launch)
         return launch.colors
 
-    def supervise(self, terms: LossTerms, colors: Tensor, truth: GroundTruth, update: MapUpdate) -> LossOutput:
+    def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel.
         # If only one of the two is in host memory, they do not.
         photos, starts = truth.photos.colors, update.maps.offsets[list(truth.samples.view_ids)]
