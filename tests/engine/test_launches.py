@@ -21,7 +21,7 @@ from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS
 from turbogs_plugin.engine.rules import LossTerms, ParameterRates
-from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, PixelSamples
+from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, LossOutput, PixelSamples
 
 CSRC = Path(__file__).resolve().parents[2] / "csrc"
 LISTS = ("Tensors", "Integers", "Reals")
@@ -33,6 +33,7 @@ OBJECTS = {
     "Rates": ParameterRates,
     "SampleArrays": PixelSamples,
     "LossSettings": LossTerms,
+    "LossOutput": LossOutput,
 }
 """What stands for the protocols of `launches`."""
 

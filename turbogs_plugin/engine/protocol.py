@@ -163,6 +163,7 @@ class Engine(Protocol):
         Args:
             moments: None where the statistics alone will be read, and more updates follow.
         """
+        return
 
     def agreed(self, update: RowUpdate | None) -> RowUpdate | None:
         """The change of the set of Gaussians that is made, where density control proposes this one."""
@@ -177,3 +178,4 @@ class Engine(Protocol):
         Raises:
             TrainingStopped: devices hold different states.
         """
+        return

@@ -9,9 +9,8 @@ a view or with more than `MAX_VIEWS`, raises `RuntimeError`, which names the ten
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,7 +27,7 @@ from turbogs_plugin.engine.render_pass import ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.engine.shared import ModelCopies
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds, slots_of_tiles
+from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds
 from turbogs_plugin.types import (
     BLACK,
     Color,
@@ -45,129 +44,78 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     """`Engine.draw`: sets equal to `draw_pixels`'s. `view_ids`: at most `MAX_VIEWS`."""
     maps.fetch(view_ids)
     views = np.asarray(view_ids, dtype=np.int64)
-    device, sizes = maps.errors.device, maps.sizes[views]
-    shapes, masks = tuple(map(tuple, sizes.tolist())), launches.NO_MASKS
-    origin = rule.origin(step.iteration, masked=maps.masks is not None)
-    if maps.masks is None:
-        starts = TileGrid(sizes, origin).starts
-        tiles, live_starts = tuple([end - start for start, end in pairwise(starts)]), None
+    device, sizes, masks, by_tile = maps.errors.device, maps.sizes[views], maps.masks, rule.unit == "tile"
+    shapes, origin = tuple(map(tuple, sizes.tolist())), rule.origin(step.iteration, masked=masks is not None)
+    if masks is None:
+        tiles = tuple([end - start for start, end in pairwise(TileGrid(sizes, origin).starts)])
+        live, live_starts = None, (0,) * len(tiles)
     else:
-        masks = maps.masks
-        tiles, live_starts = tuple(masks.live_counts(view_ids)), tuple(masks.offsets[views].tolist())
-    places = _places(rule, _wanted(rule, rate, tiles), shapes, tiles, live_starts)
+        tiles = live = tuple(masks.live_counts(view_ids))
+        live_starts = tuple(masks.offsets[views].tolist())
+    wanted = tuple([rule.wanted(rate, count if by_tile else TILE_PIXELS) for count in tiles])
+    ends = DrawEnds(rule.unit, shapes, wanted, live)
+    chosen, slots, draws = _places(rule, ends, tiles, live_starts)
     scratch = launches.NO_SCRATCH
-    if rule.unit == "tile":
+    if by_tile:
         dtypes = (torch.float64, torch.int32, torch.int64, torch.float32)
         scratch = launches.TileScratch(*(torch.empty(sum(tiles), dtype=dtype, device=device) for dtype in dtypes))
-    slots, chosen = places.slots, places.chosen
     parts = slots, chosen, chosen + 1
     memory = torch.empty(sum(parts), dtype=torch.int32, device=device)  # in less of the host's time than three tensors
-    pixel_ids, tile_ids, tile_offsets = memory.split_with_sizes(parts)
+    samples = PixelSamples(
+        tuple(view_ids),
+        sizes,
+        *memory.split_with_sizes(parts),
+        weights=torch.empty(slots, device=device) if rule.importance else None,
+        has_empty_slots=by_tile or masks is not None,
+        host_ends=ends,
+        origin=origin,
+    )
     draw = launches.SamplePixels(
         errors=maps.errors,
         stamps=maps.stamps,
-        views=view_rows(maps.offsets[views].tolist(), shapes, view_ids, places.draws),
+        views=view_rows(maps.offsets[views].tolist(), shapes, view_ids, draws),
         grid=launches.GridOrigin(*origin),
         unit=SAMPLE_UNITS.index(rule.unit),
-        masks=masks,
-        slots_per_tile=places.slots_per_tile,
+        masks=launches.NO_MASKS if masks is None else masks,
+        slots_per_tile=0 if by_tile else wanted[0],
         mixed_uniform=rule.mixed_uniform,
         importance=rule.importance,
         seed=step.seed,
         iteration=step.iteration,
         now=maps.now(step),
-        pixel_ids=pixel_ids,
-        tile_ids=tile_ids,
-        tile_offsets=tile_offsets,
-        weights=torch.empty(slots, device=device) if rule.importance else None,
+        samples=samples,
         scratch=scratch,
     )
     if slots:  # else every pixel is masked
         library.launch(draw)
     else:
-        draw.tile_offsets.zero_()
-    weights = draw.weights
-    if weights is not None:
-        weights = weights * ((draw.pixel_ids >= 0).sum() / weights.sum())
-    return PixelSamples(
-        tuple(view_ids),
-        sizes,
-        draw.pixel_ids,
-        draw.tile_ids,
-        draw.tile_offsets,
-        weights,
-        has_empty_slots=rule.unit != "pixel" or maps.masks is not None,
-        host_ends=places.ends,
-        origin=origin,
-    )
-
-
-@dataclass(frozen=True)
-class _Places:
-    """Sizes of a draw from views of given sizes.
-
-    Args:
-        chosen: tiles of all views that get samples.
-        slots: of all views.
-        slots_per_tile: 0 where tiles are drawn.
-        draws: for each view the last six numbers of its `layout.DrawRow`.
-        ends: see `PixelSamples.host_ends`.
-    """
-
-    chosen: int
-    slots: int
-    slots_per_tile: int
-    draws: tuple[tuple[int, ...], ...]
-    ends: DrawEnds
-
-
-def _wanted(rule: DrawRule, rate: float, tiles: Sequence[int]) -> tuple[int, ...]:
-    """Number of tiles drawn of each view, or of pixels drawn of each of its tiles."""
-    if rule.unit == "tile":
-        return tuple(rule.wanted(rate, count) for count in tiles)
-    return (rule.wanted(rate, TILE_PIXELS),) * len(tiles)
+        samples.tile_offsets.zero_()
+    if samples.weights is not None:
+        samples.weights *= (samples.pixel_ids >= 0).sum() / samples.weights.sum()
+    return samples
 
 
 @lru_cache(maxsize=4096)
 def _places(
-    rule: DrawRule,
-    wanted: tuple[int, ...],
-    shapes: tuple[tuple[int, int], ...],
-    tiles: tuple[int, ...],
-    live_starts: tuple[int, ...] | None,
-) -> _Places:
+    rule: DrawRule, host_ends: DrawEnds, tiles: tuple[int, ...], live_starts: tuple[int, ...]
+) -> tuple[int, int, list[tuple[int, ...]]]:
     """Sizes of a draw, cached: a hundred iterations ask for equal ones, and making them takes longer than the launch.
 
     Args:
-        wanted: of each view, from `_wanted`.
-        shapes: of each view.
         tiles: of each view, those that are not masked whole.
-        live_starts: where each view's tiles stand among the unmasked ones; None without masks.
+        live_starts: where each view's tiles stand among the unmasked ones; 0 without masks.
+
+    Returns:
+        The number of tiles that get samples; the number of their slots; for each view the last six numbers of its
+        `layout.DrawRow`.
     """
-    by_tile, slots_per_tile = rule.unit == "tile", 0
-    if by_tile:
-        ends = list(accumulate(wanted))  # of each view's chosen tiles
-        chosen, slots = ends[-1], ends[-1] * TILE_PIXELS
-    else:
-        slots_per_tile = wanted[0]
-        if live_starts is None:
-            ends = list(accumulate(_view_slots(*shape, wanted[0]) for shape in shapes))
-        else:
-            ends = list(accumulate(slots_per_tile * count for count in tiles))
-        chosen, slots = sum(tiles), ends[-1]
-    starts = live_starts or (0,) * len(tiles)
-    draws = tuple(
-        (first, *rule.stages(count), start, live)
-        for first, count, start, live in zip([0, *ends[:-1]], wanted, starts, tiles, strict=True)
-    )
-    host_ends = DrawEnds(rule.unit, shapes, wanted, None if live_starts is None else tiles)
-    return _Places(chosen, slots, slots_per_tile, draws, host_ends)
-
-
-@lru_cache(maxsize=4096)
-def _view_slots(width: int, height: int, wanted: int) -> int:
-    """Slots of a view when `wanted` pixels are drawn from each tile."""
-    return int(slots_of_tiles(wanted, np.array([[width, height]])).sum())
+    view_ends, slot_ends = host_ends()
+    firsts, starts = np.append(0, view_ends)[:-1], np.append(0, slot_ends)  # [K] tiles, [T + 1] slots
+    if rule.unit == "pixel":
+        firsts = starts[firsts]
+    columns = zip(firsts.tolist(), host_ends.wanted, live_starts, tiles, strict=True)
+    draws = [(first, *rule.stages(count), start, live) for first, count, start, live in columns]
+    return len(slot_ends), int(starts[-1]), draws
 
 
 def view_rows(
@@ -232,9 +180,7 @@ def sparse_loss(
         beta=beta,
         stamp=stamp,
         num_filled=count_filled(samples),
-        loss=output.loss,
-        color_gradients=output.color_gradients,
-        pixel_errors=output.pixel_errors,
+        output=output,
         nonfinite_losses=nonfinite_losses,
         overflow=overflow,
         background=launches.Background(*background),

@@ -135,19 +135,16 @@ class Workspace:
         Args:
             memory: None: all are the workspace's own again.
         """
-        if memory is not self._lent:
-            status = torch.empty_like(self.status) if memory is None else memory.status[: len(self.status)]
-            self._set_status(status.copy_(self.status))
-            self._kept.clear()  # holds views of buffers
+        lent = {} if memory is None else {name: getattr(memory, name) for name in LENT}
+        if memory is self._lent and all(self._buffers.get(name) is value for name, value in lent.items()):
+            return
+        status = torch.empty_like(self.status) if memory is None else memory.status[: len(self.status)]
+        self._set_status(status.copy_(self.status))
+        self._kept.clear()  # holds views of buffers
         for name in LENT:
-            held, lent = self._buffers.get(name), None if memory is None else getattr(memory, name)
-            if held is lent or (lent is None and (self._lent is None or held is not getattr(self._lent, name))):
-                continue
-            self._kept.clear()
             self._views.pop(name, None)
             self._buffers.pop(name, None)
-            if lent is not None:
-                self._buffers[name] = lent
+        self._buffers.update(lent)
         self._lent = memory
 
     def kept(self, name: str, sizes: tuple, make: Callable[[], Kept]) -> Kept:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from turbogs_plugin.masks import PixelMasks as MaskArrays
     from turbogs_plugin.types import Gaussians as GaussianArrays
     from turbogs_plugin.types import GaussianStats as StatSums
+    from turbogs_plugin.types import LossOutput
     from turbogs_plugin.types import PixelSamples as SampleArrays
 else:  # the fields that launches read of these
     GaussianArrays = fields_of(Tensor="means quats scales opacities sh0 shN")  # quats and shN 16-byte aligned
@@ -50,6 +51,7 @@ else:  # the fields that launches read of these
     Rates = fields_of(float="means quats scales opacities sh0 shN")
     MaskArrays = fields_of(Tensor="tiles rows bits")  # [L] int32, [L] int32, [B, 8] int32
     LossSettings = fields_of(float="epsilon l1_weight structure_weight variance_constant", bool="balance")
+    LossOutput = fields_of(Tensor="loss color_gradients pixel_errors")
     MapArrays = fields_of(Tensor="errors stamps view_sums")  # [X] float16, [X] int16, [V] float64
 
 __all__ = ["LAUNCHES", "Launch", "field_types", "nested_type"]
@@ -249,7 +251,7 @@ NO_SCRATCH = TileScratch(None, None, None, None)
 
 @dataclass
 class SamplePixels(Launch):
-    """Draw samples: writes `pixel_ids`, `tile_ids`, `tile_offsets` and `weights`."""
+    """Draw samples: writes the tensors of `samples`."""
 
     errors: Tensor  # [X] float16
     stamps: Tensor  # [X] int16
@@ -263,10 +265,7 @@ class SamplePixels(Launch):
     seed: int
     iteration: int
     now: int  # a stamp's age is `now` less the stamp
-    pixel_ids: Tensor  # [P] int32
-    tile_ids: Tensor  # [T] int32
-    tile_offsets: Tensor  # [T + 1] int32
-    weights: Tensor | None  # [P] float32; None without importance
+    samples: SampleArrays  # weights are None without importance
     scratch: TileScratch
 
 
@@ -286,9 +285,7 @@ class SparseLoss(Launch):
     beta: float  # EMA weight of a new error
     stamp: int  # for the pixels visited
     num_filled: Tensor | None  # [1] int32; None where all slots are filled
-    loss: Tensor  # [] float64, zero
-    color_gradients: Tensor  # [P, 3] float32
-    pixel_errors: Tensor  # [P] float32
+    output: LossOutput  # the loss is [] float64, zero
     nonfinite_losses: Tensor | None  # [] int64, 1 is added if the loss is not finite
     overflow: Tensor | None  # [1] int32; if not 0, the maps stay as they are
     background: Background  # shows through photos with an alpha
