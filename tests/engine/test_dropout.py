@@ -79,7 +79,7 @@ def test_another_process_makes_the_same_gradients_of_some_rows(scene):
     gaussians, cameras, samples = scene
     _, screen, whole, _ = learnt(scene, HALF)
     plain, part = screen.plain(), slice(16, 48)
-    mine = type(plain)(plain.records[:, part], plain.radii[:, part], plain.with_statistics)
+    mine = type(plain)(plain.records[:, part], plain.radii[:, part])
     rows = gaussians.map(lambda value: value[part])
     options = RenderOptions(dropout=HALF)
     stats = GaussianStats.zeros(32, CPU)

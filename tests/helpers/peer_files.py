@@ -79,7 +79,7 @@ class _Screen(_Forwarding):
         plain = self._wrapped.plain()
         if self._engine.lent is None:
             return plain
-        kept = ScreenRecords(*self._engine.views(*plain.records.shape[:2]), plain.with_statistics)
+        kept = ScreenRecords(*self._engine.views(*plain.records.shape[:2]))
         kept.records.copy_(plain.records)
         kept.radii.copy_(plain.radii)
         return kept

@@ -193,7 +193,6 @@ class InPlace:
         return ScreenRecords(
             part.as_strided(*shapes[0], records),
             part.as_strided(*shapes[1], radii).view(torch.int32),
-            with_statistics=False,
         )
 
 

@@ -247,7 +247,7 @@ class SharedRendered(Rendered):
             errors = None if upstream.pixel_errors is None else upstream.pixel_errors[slots]
             own = self._rendered.backward(upstream.color_gradients[slots], errors, with_statistics=with_statistics)
             plain = own.plain()
-        return SharedScreen(self.batch, plain, with_statistics)
+        return SharedScreen(self.batch, plain)
 
 
 @dataclass
@@ -256,7 +256,6 @@ class SharedScreen:
 
     batch: Batch
     _plain: ScreenRecords | None
-    _with_statistics: bool
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
         """`ScreenGradients.parameter_gradients`, of all views and Gaussians, on every process."""
@@ -285,7 +284,7 @@ class SharedScreen:
         batch, shape = self.batch, (len(self.batch.samples.view_ids), len(own))
         records = torch.empty(*shape, ScreenRecord.SIZE, device=own.device)
         radii = torch.empty(*shape, 2, dtype=torch.int32, device=own.device)
-        target = ScreenRecords(records, radii, self._with_statistics)
+        target = ScreenRecords(records, radii)
         batch.exchange.collect(batch.engine, batch.shares, rows, self._plain, target)
         return batch.engine.screen_gradients(own, batch.cameras, batch.samples, batch.options, target)
 

@@ -151,20 +151,6 @@ def step_exposures(
     exposures.offsets -= torch.where(usable.any(), exposures.offsets.mean(dim=0), 0.0)
 
 
-def learn_exposures(
-    exposures: Exposures,
-    colors: Tensor,
-    gradients: Tensor,
-    samples: PixelSamples,
-    rate: float,
-    overflow: Tensor | None = None,
-) -> Tensor:
-    """`exposure_gradients`, then `step_exposures` with them: [P, 3] float32, d loss / d colours."""
-    of_colors, sums = exposure_gradients(exposures, colors, gradients, samples)
-    step_exposures(exposures, sums, samples.view_ids, rate, overflow)
-    return of_colors
-
-
 def _of_slots(exposures: Exposures, samples: PixelSamples) -> Tensor:
     """[P, 3, 4]: the offsets of each slot's photo."""
     rows = on_device(samples.view_ids, exposures.offsets.device)

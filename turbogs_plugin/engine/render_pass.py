@@ -42,12 +42,10 @@ class ScreenRecords:
     Args:
         records: [K, N, 16], `layout.ScreenRecord`; where a Gaussian is not drawn, a record may hold anything.
         radii: [K, N, 2] int32 pixels, zero where off screen.
-        with_statistics: whether the columns that only density control asks for were filled.
     """
 
     records: Tensor
     radii: Tensor
-    with_statistics: bool
 
 
 class ScreenGradients(Protocol):
@@ -72,12 +70,6 @@ class ScreenGradients(Protocol):
 
     def plain(self) -> ScreenRecords:
         """Plain tensors; the inverse of `Engine.screen_gradients`."""
-
-
-def require_statistics(with_statistics: bool, stats: GaussianStats | None) -> None:
-    """Raise `ValueError` if statistics are wanted from a backward pass that did not sum them up."""
-    if stats is not None and not with_statistics:
-        raise ValueError("statistics of a pass without them: call Rendered.backward(..., with_statistics=True)")
 
 
 @dataclass(frozen=True)

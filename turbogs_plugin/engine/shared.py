@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import PassStatus
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import Engine
-from turbogs_plugin.engine.reference.records import collect_records, gather_colors
 from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients, ScreenRecords
 from turbogs_plugin.engine.rules import UpdateRule
@@ -73,6 +73,25 @@ class ModelCopies:
         if any(len(each) != 1 for each in found):
             raise InputError("a copy of a model must lie as the model does: its parameters as far from each other")
         return tuple(distance for each in found for distance in each)
+
+
+def collect_records(sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
+    """`Engine.collect`. Where a Gaussian is off screen, this copies as well what the sources' records hold."""
+    rows, end = slice(row, row + target.records.shape[1]), 0
+    for source, view in zip(sources, views, strict=True):
+        if view < end:  # shared with the process before
+            target.records[view] += source.records[0, rows]
+        new, fresh = slice(end - view, None), slice(end, view + len(source.records))
+        target.records[fresh], target.radii[fresh] = source.records[new, rows], source.radii[new, rows]
+        end = fresh.stop
+
+
+def gather_colors(parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
+    """`Engine.gather`, without the engine's own flag."""
+    statuses = torch.stack([part[: PassStatus.SIZE].view(torch.int32) for part in parts])  # [processes, 3]
+    seen.copy_(statuses[:, PassStatus.OVERFLOW :].amax(dim=0))
+    pieces = [part[first : first + 3 * count] for part, count in zip(parts, counts, strict=True)]
+    return torch.cat(pieces).view(-1, 3)
 
 
 class SharedEngine(Engine):

@@ -28,7 +28,6 @@ from turbogs_plugin.engine.render_pass import (
     ScreenGradients,
     ScreenRecords,
     Upstream,
-    require_statistics,
 )
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
@@ -65,7 +64,6 @@ class CudaScreenGradients(ScreenGradients):
         samples: the pass's samples.
         records: [K, N, 16] float32, `layout.ScreenRecord`. Where a Gaussian is off screen, a record may hold anything.
         radii: [K, N, 2] int32, zero where off screen.
-        with_statistics: whether the columns that only density control asks for were filled.
         overflow: [1] int32 on the device, or None; if not 0, the pass drew nothing and nothing may change.
     """
 
@@ -73,11 +71,10 @@ class CudaScreenGradients(ScreenGradients):
     samples: PixelSamples
     records: Tensor
     radii: Tensor
-    with_statistics: bool = False
     overflow: Tensor | None = None
 
     def plain(self) -> ScreenRecords:
-        return ScreenRecords(self.records, self.radii, self.with_statistics)
+        return ScreenRecords(self.records, self.radii)
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
         # The fields that have rows are views of one packed [K, N, 14] tensor. After an overflow they are zero.
@@ -97,7 +94,6 @@ class CudaScreenGradients(ScreenGradients):
 
     def backward_arguments(self, stats: GaussianStats | None) -> launches.ScreenBackward:
         """The arguments shared by the launches that take these gradients to the parameters."""
-        require_statistics(self.with_statistics, stats)
         return launches.ScreenBackward(
             scene=self.scene,
             records=self.records,
@@ -152,7 +148,7 @@ class CudaRendered(Rendered):
         self._cleared = False
         overflow = None if self._workspace is None else self._workspace.overflow
         records = records.view(*self._radii.shape[:2], ScreenRecord.SIZE)
-        return CudaScreenGradients(self._scene, self._samples, records, self._radii, with_statistics, overflow)
+        return CudaScreenGradients(self._scene, self._samples, records, self._radii, overflow)
 
 
 def scene_of(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> launches.Scene:

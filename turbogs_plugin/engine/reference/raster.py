@@ -21,7 +21,6 @@ from turbogs_plugin.engine.render_pass import (
     ScreenGradients,
     ScreenRecords,
     Upstream,
-    require_statistics,
 )
 from turbogs_plugin.engine.rules import Dropout
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
@@ -37,7 +36,6 @@ class ReferenceScreenGradients(ScreenGradients):
         leaves: the parameters of the rows, see `Rows.take`.
         records: [R, 16], see `layout.ScreenRecord`.
         samples: the pass's samples.
-        with_statistics: whether the pass summed up statistics.
     """
 
     rows: Rows
@@ -45,15 +43,11 @@ class ReferenceScreenGradients(ScreenGradients):
     leaves: Gaussians
     records: Tensor
     samples: PixelSamples
-    with_statistics: bool = False
 
     def plain(self) -> ScreenRecords:
-        return ScreenRecords(
-            self.rows.scatter(self.records), self.rows.scatter(self.splats.radii), self.with_statistics
-        )
+        return ScreenRecords(self.rows.scatter(self.records), self.rows.scatter(self.splats.radii))
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
-        require_statistics(self.with_statistics, stats)
         records, splats = self.records, self.splats
         outputs = (splats.means2d, splats.conics, splats.colors, splats.opacities, splats.depths)
         columns = (ScreenRecord.MEAN, ScreenRecord.CONIC, ScreenRecord.COLOR, ScreenRecord.OPACITY, ScreenRecord.DEPTH)
@@ -134,9 +128,7 @@ class ReferenceRendered(Rendered):
         records = compositing.composite_backward(
             self._compositor, self._table, self._sums, gradients, given["pixel_errors"]
         )
-        return ReferenceScreenGradients(
-            self._rows, self._splats, self._leaves, records, self._compositor.samples, with_statistics
-        )
+        return ReferenceScreenGradients(self._rows, self._splats, self._leaves, records, self._compositor.samples)
 
 
 def rasterize_reference(
@@ -175,7 +167,7 @@ def screen_gradients(
     """`Engine.screen_gradients`: projects those Gaussians again that were drawn."""
     rows, leaves, splats = _projected(gaussians, cameras, options, (plain.radii > 0).any(dim=-1).T)
     records = plain.records.flatten(0, 1)[rows.flat]  # [R, 16]
-    return ReferenceScreenGradients(rows, splats, leaves, records, samples, plain.with_statistics)
+    return ReferenceScreenGradients(rows, splats, leaves, records, samples)
 
 
 def _projected(
