@@ -28,7 +28,7 @@ from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = [
     pytest.mark.gpu,
-    pytest.mark.skipif(not kernels.available(), reason="needs a GPU and the kernels"),
+    pytest.mark.skipif(bool(kernels.unavailable_reason()), reason="needs a GPU and the kernels"),
 ]
 
 GPU = torch.device("cuda")

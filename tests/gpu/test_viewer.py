@@ -18,7 +18,7 @@ from turbogs_plugin.viewer.pictures import CaptureViews, DensityChange, ModelSta
 
 pytestmark = [
     pytest.mark.gpu,
-    pytest.mark.skipif(not kernels.available(), reason="needs a GPU and the kernels"),
+    pytest.mark.skipif(bool(kernels.unavailable_reason()), reason="needs a GPU and the kernels"),
 ]
 CUDA, CPU = torch.device("cuda"), torch.device("cpu")
 

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from turbogs_plugin.engine.reference.losses import TileGroups, window_similarity
-from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.losses import EPSILON, CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.tiles import pixel_table
@@ -178,11 +177,6 @@ def test_windows_within_a_tile_are_those_of_the_evaluation(origin):
     mask[ids[whole].long()] = True
     assert whole.sum() == 36
     assert found[whole].mean().item() == pytest.approx(ssim(image, photo, mask.view(32, 40)).item(), rel=1e-9)
-
-
-def test_ssim_has_no_balance():
-    with pytest.raises(ValueError, match="ssim has no balance"):
-        LossTerms(1e-3, structure="ssim", structure_weight=0.2, balance=True)
 
 
 @pytest.mark.parametrize("level", [1.0, 1e4, 1e6, 1e8])

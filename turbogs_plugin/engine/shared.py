@@ -39,11 +39,6 @@ class PassMemory:
     records: Tensor
 
     @cached_property
-    def overflow(self) -> Tensor:
-        """[1] int32 of `status`."""
-        return self.status[PassStatus.OVERFLOW :][:1]
-
-    @cached_property
     def stop(self) -> Tensor:
         """[1] int32 of `status`."""
         return self.status[PassStatus.STOP :][:1]

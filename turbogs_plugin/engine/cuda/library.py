@@ -63,11 +63,6 @@ def unavailable_reason() -> str:
     return _mismatch(architectures(), torch.cuda.get_device_capability())
 
 
-def available() -> bool:
-    """The library is loaded, torch sees a CUDA device, and the library has code for it."""
-    return not unavailable_reason()
-
-
 class _Operators:
     """The library's operators as attributes, each kept: to look one up for each launch takes a third of the call."""
 

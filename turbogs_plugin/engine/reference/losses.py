@@ -31,7 +31,7 @@ def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: Pixe
     """The loss of some samples and its gradient::
 
         L = l1_weight * l1 + structure_weight * mean over tiles of f * mean over channels of (1 - S)
-        f = lambda with `balance`, else 1
+        f = lambda where `LossTerms.balance`, else 1
         lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
 
     l1 is the Charbonnier term of `_Problem`, S the similarity named by `structure`. ``grad l1`` is
