@@ -28,17 +28,6 @@ def test_each_gaussian_has_the_same_chance(share):
         assert abs((left[0] * other).mean() - share**2) < 5 * deviation
 
 
-def test_a_larger_share_leaves_out_more_of_the_same_draw():
-    few, many = (kept(Dropout(share, 3, 7), 1000, CPU) for share in (0.2, 0.5))
-    assert not (many & ~few).any() and int(many.sum()) < int(few.sum())
-    assert torch.equal(few, kept(Dropout(0.2, 3, 7), 1000, CPU))
-    assert torch.equal(few[:100], kept(Dropout(0.2, 3, 7), 100, CPU))  # a row's draw does not depend on their number
-
-
-def test_no_share_leaves_out_nothing():
-    assert kept(NO_DROPOUT, COUNT, CPU) is None and kept(Dropout(0.0, 3, 7), COUNT, CPU) is None
-
-
 @pytest.fixture(scope="module")
 def scene():
     cameras = make_cameras([(40, 33), (21, 48)])
@@ -89,10 +78,3 @@ def test_another_process_makes_the_same_gradients_of_some_rows(scene):
     assert torch.equal(gradients.touched, whole.touched[part]) and whole.touched[part].any()
     torch.testing.assert_close(gradients.means, whole.means[:, part])
     torch.testing.assert_close(gradients.opacities, whole.opacities[:, part])
-
-
-def test_leaving_out_all_draws_the_background(scene):
-    gaussians, cameras, samples = scene
-    options = RenderOptions(dropout=Dropout(1 - 2**-40), background=(0.2, 0.4, 0.6))
-    rendered = ReferenceEngine().render(gaussians, cameras, samples, options)
-    torch.testing.assert_close(rendered.colors, rendered.colors.new_tensor([0.2, 0.4, 0.6]).expand_as(rendered.colors))

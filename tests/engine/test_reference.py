@@ -14,7 +14,7 @@ from turbogs_plugin.engine.render import dense_samples, rasterize, render_image
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
-from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, PixelSamples, sample_order
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, PixelSamples
 
 SIZES = [(37, 29), (20, 50)]
 ACTIVATED = {"opaque": 5.0, "as made": 0.0}
@@ -370,17 +370,3 @@ def test_settings_are_used():
 def test_settings_out_of_bounds_are_refused(values):
     with pytest.raises(InputError, match=f"{list(values)[-1]} = "):
         RasterSettings(**values)
-
-
-def test_dense_samples_are_every_pixel_in_sample_order():
-    cameras = make_cameras([(37, 29), (5, 16), (16, 32)])
-    samples = dense_samples(cameras, [2, 0])
-    assert samples.view_ids == (2, 0) and samples.sizes.tolist() == [[16, 32], [37, 29]]
-    assert sorted(samples.pixel_ids[: 16 * 32].tolist()) == list(range(16 * 32))
-    assert sorted(samples.pixel_ids[16 * 32 :].tolist()) == list(range(37 * 29))
-    x, y = samples.coordinates().unbind(dim=-1)
-    ranks = sample_order(x % 16, y % 16)
-    assert (x[samples.view_of_slot() == 0] < 16).all()
-    for first, last in zip(samples.tile_offsets[:-1].tolist(), samples.tile_offsets[1:].tolist(), strict=True):
-        assert (ranks[first:last].diff() > 0).all()
-        assert len(set(zip((x[first:last] // 16).tolist(), (y[first:last] // 16).tolist(), strict=True))) == 1

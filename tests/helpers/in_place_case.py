@@ -76,7 +76,7 @@ class Kept:
             setattr(owner, name, method)
         messages, engine = Messages(ranks), None  # which need no engine to collect
         for screen, rows, records, radii in self.screens:
-            target = ScreenRecords(torch.empty_like(records), torch.empty_like(radii), False)
+            target = ScreenRecords(torch.empty_like(records), torch.empty_like(radii))
             messages.collect(engine, screen.batch.shares, rows, screen._plain, target)
             assert torch.equal(radii, target.radii)
             seen = (radii > 0).any(dim=-1)
