@@ -101,10 +101,6 @@ class RanksEngine:
         return self.engine.overflow
 
     @property
-    def bytes_held(self) -> int:
-        return self.engine.bytes_held
-
-    @property
     def way(self) -> str:
         """How colours and records went in the latest pass."""
         return "messages" if self._exchange is self.messages else "in place"

@@ -60,11 +60,6 @@ class Engine(Protocol):
         nothing, because a buffer was too small. None if that cannot happen."""
         return None
 
-    @property
-    def bytes_held(self) -> int:
-        """Bytes of memory kept from one iteration to the next."""
-        return 0
-
     @abstractmethod
     def draw(self, rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
         """Draw the samples of an iteration.

@@ -101,7 +101,3 @@ class CudaEngine(SharedEngine):
         if self.workspace is not None:
             self.workspace.take_lost(wait=True)
             self.workspace.status.zero_()
-
-    @property
-    def bytes_held(self) -> int:
-        return 0 if self.workspace is None else self.workspace.bytes_held()

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.cuda import launches, library
-from turbogs_plugin.engine.cuda.raster import CudaScreenGradients, count_filled, plain_floats
+from turbogs_plugin.engine.cuda.raster import Buffers, CudaScreenGradients, count_filled, plain_floats
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import MAX_PEERS, SAMPLE_UNITS, STRUCTURES, UPDATE_KINDS
 from turbogs_plugin.engine.moments import GaussianMoments
@@ -41,7 +41,7 @@ from turbogs_plugin.types import (
 
 
 def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
-    """`Engine.draw`: sets equal to `draw_pixels`'s. `view_ids`: at most `MAX_VIEWS`."""
+    """`Engine.draw`: sets equal to `draw_pixels`'s."""
     maps.fetch(view_ids)
     views = np.asarray(view_ids, dtype=np.int64)
     device, sizes, masks, by_tile = maps.errors.device, maps.sizes[views], maps.masks, rule.unit == "tile"
@@ -139,22 +139,18 @@ def sparse_loss(
     background: Color = BLACK,
     workspace: Workspace | None = None,
 ) -> LossOutput:
-    """Loss, gradient and pixel errors, in one launch. With `update` it also does what `ErrorMaps.update` does.
-
-    A sample whose colour is not finite counts as an empty slot: its gradient and error are zero, and its pixel in the
-    maps stays as it is.
+    """`Engine.evaluate`, and with `update` `Engine.learn`, in one launch.
 
     Args:
         colors: [P, 3] float32 or float16.
         targets: [P, 3] float32, the truth at the samples. Or [X, 3 or 4] uint8, the photos of all views, from which the
             kernel gathers; they are laid out like the maps, so `update` is then needed.
-        samples: of at most `MAX_VIEWS` views.
         overflow: [1] int32 on the device, or None; if it is not 0, maps and count of `update` stay as they are.
         background: shows through photos that have an alpha.
         workspace: has memory for the gradients and errors, which are then valid until it is used for the next loss.
 
     Returns:
-        The loss (a float64 scalar on the device), gradients [P, 3] float32 and errors [P] float32.
+        The loss is a float64 scalar on the device, gradients and errors are float32.
     """
     colors = plain_floats(colors)
     photos = targets if targets.dtype == torch.uint8 else None
@@ -164,9 +160,12 @@ def sparse_loss(
         maps, nonfinite_losses = update.maps, update.nonfinite_losses
         beta, stamp = maps.beta, maps.stamp(update.step)
         starts = maps.offsets[list(samples.view_ids)].tolist()
-    elif photos is not None:
-        raise ValueError("photos are gathered from where the maps of each view begin: give `update`")
-    output = _loss_output(len(colors), colors.device, workspace)
+    buffers, slots = Buffers(workspace, colors.device), len(colors)
+    output = LossOutput(
+        loss=torch.zeros((), dtype=torch.float64, device=colors.device) if workspace is None else workspace.zero(),
+        color_gradients=buffers.floats("color_gradients", slots, 3),
+        pixel_errors=buffers.floats("pixel_errors", slots),
+    )
     loss = launches.SparseLoss(
         colors=colors,
         targets=None if photos is not None else plain_floats(targets),
@@ -189,15 +188,6 @@ def sparse_loss(
     return output
 
 
-def _loss_output(slots: int, device: torch.device, workspace: Workspace | None) -> LossOutput:
-    """Output for the kernel to fill; its loss is zero."""
-    if workspace is None:
-        zero = torch.zeros((), dtype=torch.float64, device=device)
-        return LossOutput(zero, torch.empty(slots, 3, device=device), torch.empty(slots, device=device))
-    gradients = workspace.buffer("color_gradients", (slots, 3), torch.float32)
-    return LossOutput(workspace.zero(), gradients, workspace.buffer("pixel_errors", (slots,), torch.float32))
-
-
 def fused_step(
     rule: UpdateRule,
     screen: ScreenGradients,
@@ -210,7 +200,7 @@ def fused_step(
     `stats`, and leaves nothing of use in `screen.records`.
 
     Args:
-        screen: of a backward pass of this engine and at most `MAX_VIEWS` views.
+        screen: of a backward pass of this engine.
         gaussians: the model that `screen` was made from: float32, contiguous.
         moments: its optimizer state, float32.
         copies: of `gaussians`, `MAX_PEERS` - 1 at most.

@@ -166,10 +166,6 @@ class Workspace:
             self._zeros.extend(torch.zeros(ZEROS_AT_ONCE, dtype=torch.float64, device=self.device).unbind())
         return self._zeros.pop()
 
-    def bytes_held(self) -> int:
-        """Bytes of all buffers."""
-        return sum(held.numel() * held.element_size() for held in self._buffers.values())
-
     def capacity(self, gaussians: int, tiles: int) -> int | None:
         """Number of intersections that a pass gets memory for, or None if nothing is known yet.
 
