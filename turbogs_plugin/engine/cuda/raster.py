@@ -118,14 +118,18 @@ def count_filled(samples: PixelSamples) -> Tensor | None:
 class CudaRendered(Rendered):
     """One forward pass (see `Rendered`). With a workspace, valid until the next pass."""
 
-    num_intersections: Tensor
-    """[1] int32 on the device: the intersections of tiles and splats of this pass."""
+    _status: Tensor = field(repr=False)  # [2] int32, of `layout.PassStatus`
     _scene: launches.Scene = field(repr=False)
     _samples: PixelSamples = field(repr=False)
     _workspace: Workspace | None = field(repr=False)
     _radii: Tensor = field(repr=False)  # [K, N, 2]
     _forward: launches.RasterForward = field(repr=False)
     _cleared: bool = field(repr=False)  # the projection has cleared the records on screen, for one backward pass
+
+    @property
+    def num_intersections(self) -> Tensor:
+        """[1] int32 on the device: the intersections of tiles and splats of this pass."""
+        return self._status[:1]
 
     @torch.no_grad()
     def projected(self) -> Projected:
@@ -185,36 +189,27 @@ class Buffers:
         return of_sizes() if self.workspace is None else self.workspace.kept(name, sizes, of_sizes)
 
 
-@dataclass(frozen=True)
-class _Front:
-    """Buffers of the projection and of the count of intersections."""
-
-    splats: launches.Splats
-    tiles: launches.TileLists
-    num_intersections: Tensor  # the first number of `tiles.status`
-    block_sums: Tensor
-    records: Tensor | None
-
-    @classmethod
-    def of(cls, buffers: Buffers, views: int, count: int, num_active: int, num_tiles: int) -> _Front:
-        workspace = buffers.workspace
-        splats = launches.Splats(
-            cameras=buffers.floats("cameras", views, layout.CameraRow.SIZE),
-            instances=buffers.floats("instances", views * count, InstanceRow.SIZE),
-            radii=buffers.integers("radii", views, count, 2),
-            active_prefix=None if num_active == num_tiles else buffers.integers("active_prefix", num_tiles + 1),
-        )
-        tiles = launches.TileLists(
-            tile_cursors=buffers.integers("tile_cursors", num_active + 1),
-            tile_starts=buffers.integers("tile_starts", num_active + 1),
-            status=torch.zeros(2, dtype=torch.int32, device=buffers.device) if workspace is None else workspace.status,
-            counters=buffers.integers("counters", 2),
-        )
-        blocks = max(1, math.ceil(num_active / layout.SCAN_TILES))
-        block_sums = buffers.integers("block_sums", blocks, 2, dtype=torch.int64)
-        # With a workspace a backward pass is likely to follow.
-        records = None if workspace is None else buffers.floats("records", views * count, ScreenRecord.SIZE)
-        return cls(splats, tiles, tiles.status[:1], block_sums, records)
+def _front_arrays(
+    buffers: Buffers, views: int, count: int, num_active: int, num_tiles: int
+) -> tuple[launches.Splats, launches.TileLists, Tensor, Tensor | None]:
+    """What the projection and the count of intersections write: splats, lists of tiles, sums of blocks, records."""
+    workspace = buffers.workspace
+    splats = launches.Splats(
+        cameras=buffers.floats("cameras", views, layout.CameraRow.SIZE),
+        instances=buffers.floats("instances", views * count, InstanceRow.SIZE),
+        radii=buffers.integers("radii", views, count, 2),
+        active_prefix=None if num_active == num_tiles else buffers.integers("active_prefix", num_tiles + 1),
+    )
+    tiles = launches.TileLists(
+        tile_cursors=buffers.integers("tile_cursors", num_active + 1),
+        tile_starts=buffers.integers("tile_starts", num_active + 1),
+        status=torch.zeros(2, dtype=torch.int32, device=buffers.device) if workspace is None else workspace.status,
+        counters=buffers.integers("counters", 2),
+    )
+    block_sums = buffers.integers("block_sums", max(1, math.ceil(num_active / layout.SCAN_TILES)), 2, dtype=torch.int64)
+    # With a workspace a backward pass is likely to follow.
+    records = None if workspace is None else buffers.floats("records", views * count, ScreenRecord.SIZE)
+    return splats, tiles, block_sums, records
 
 
 def _intersection_arrays(buffers: Buffers, capacity: int) -> launches.Intersections:
@@ -265,15 +260,14 @@ def rasterize_cuda(
     # A pass over every tile needs no table of the active ones.
     everywhere = num_active == num_tiles
     tile_ids = None if everywhere else samples.tile_ids.contiguous()
-    front = buffers.kept("front", _Front.of, views, count, num_active, num_tiles)
-    splats, tiles = front.splats, front.tiles
+    splats, tiles, block_sums, records = buffers.kept("front", _front_arrays, views, count, num_active, num_tiles)
     grid = launches.GridOrigin(*samples.origin)
-    arrays = (splats, tile_ids, tiles.tile_cursors, front.records)
+    arrays = (splats, tile_ids, tiles.tile_cursors, records)
     library.launch(launches.RasterProject(scene, grid, settings, options.dropout, *arrays))
 
     capacity = None if workspace is None else workspace.capacity(count, num_active)
     most = layout.INTERSECTIONS_MAX if capacity is None else capacity
-    library.launch(launches.RasterCountIntersections(tiles, front.block_sums, most))
+    library.launch(launches.RasterCountIntersections(tiles, block_sums, most))
     if capacity is None:
         found = int(tiles.status[0])
         require_possible(found)
@@ -304,7 +298,7 @@ def rasterize_cuda(
         forward.pixels.colors,
         forward.pixels.alphas,
         forward.depths,
-        num_intersections=front.num_intersections,
+        _status=tiles.status,
         _scene=scene,
         _samples=samples,
         _workspace=workspace,

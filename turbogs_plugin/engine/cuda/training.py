@@ -61,10 +61,13 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
         scratch = launches.TileScratch(*(torch.empty(sum(tiles), dtype=dtype, device=device) for dtype in dtypes))
     parts = slots, chosen, chosen + 1
     memory = torch.empty(sum(parts), dtype=torch.int32, device=device)  # in less of the host's time than three tensors
+    pixel_ids, tile_ids, tile_offsets = memory.split_with_sizes(parts)
     samples = PixelSamples(
         tuple(view_ids),
         sizes,
-        *memory.split_with_sizes(parts),
+        pixel_ids,
+        tile_ids,
+        tile_offsets,
         weights=torch.empty(slots, device=device) if rule.importance else None,
         has_empty_slots=by_tile or masks is not None,
         host_ends=ends,
@@ -98,7 +101,7 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
 @lru_cache(maxsize=4096)
 def _places(
     rule: DrawRule, host_ends: DrawEnds, tiles: tuple[int, ...], live_starts: tuple[int, ...]
-) -> tuple[int, int, list[tuple[int, ...]]]:
+) -> tuple[int, int, list[list[int]]]:
     """Sizes of a draw, cached: a hundred iterations ask for equal ones, and making them takes longer than the launch.
 
     Args:
@@ -114,7 +117,7 @@ def _places(
     if rule.unit == "pixel":
         firsts = starts[firsts]
     columns = zip(firsts.tolist(), host_ends.wanted, live_starts, tiles, strict=True)
-    draws = [(first, *rule.stages(count), start, live) for first, count, start, live in columns]
+    draws = [[first, *rule.stages(count), start, live] for first, count, start, live in columns]
     return len(slot_ends), int(starts[-1]), draws
 
 
@@ -122,7 +125,7 @@ def view_rows(
     starts: Sequence[int],
     shapes: Sequence[Sequence[int]],
     view_ids: Sequence[int],
-    draws: Sequence[tuple[int, ...]] | None = None,
+    draws: Sequence[Sequence[int]] | None = None,
 ) -> list[int]:
     """A `layout.ViewRow` for each view (with `draws` a `layout.DrawRow`), end to end. `shapes`: (width, height)."""
     columns = zip(starts, shapes, view_ids, draws or [()] * len(view_ids), strict=True)

@@ -52,8 +52,9 @@ class Compositor:
     samples: PixelSamples
     settings: RasterSettings
 
-    def __post_init__(self) -> None:
-        self.device = self.intersections.rows.device
+    @property
+    def device(self) -> torch.device:
+        return self.intersections.rows.device
 
     def blocks(self) -> Iterator[Block]:
         """All tiles that have both samples and intersections, those with the most intersections first."""

@@ -73,7 +73,8 @@ def tile_moments(problem: _Problem) -> tuple[Tensor, Tensor, Tensor, Tensor, Ten
     mean_x, mean_y = groups.mean(torch.cat([relative_x, relative_y], dim=1)).chunk(2, dim=1)
     offset_x, offset_y = relative_x - groups.spread(mean_x), relative_y - groups.spread(mean_y)
     products = torch.cat([offset_x * offset_x, offset_y * offset_y, offset_x * offset_y], dim=1)
-    return *groups.mean(products).chunk(3, dim=1), offset_x, offset_y
+    variance_x, variance_y, covariance = groups.mean(products).chunk(3, dim=1)
+    return variance_x, variance_y, covariance, offset_x, offset_y
 
 
 Similarity = tuple[Tensor, Tensor]
