@@ -164,7 +164,7 @@ class SharedEngine(Engine):
             plain: of these views and Gaussians.
         """
 
-    @abstractmethod
     def recover(self) -> None:
         """Prepare to repeat iterations that were skipped because another process's memory was too small: waits for the
-        device, takes in what it learned of the memory needed, and clears `overflow`."""
+        device, takes in what it learned of the memory needed, and clears `overflow`. Nothing here, where nothing is
+        kept."""

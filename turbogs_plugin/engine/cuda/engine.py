@@ -70,14 +70,9 @@ class CudaEngine(SharedEngine):
         return self.workspace is not None
 
     def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
-        def arguments(buffers: Buffers, *_: int) -> launches.GatherColors:
-            colors = buffers.floats("gathered_colors", sum(counts), 3)
-            return launches.GatherColors(colors, list(counts), first, seen, self.overflow, list(parts))
-
-        places = [part.data_ptr() for part in (*parts, seen)]
-        launch = Buffers(self.workspace, seen.device).kept("gather", arguments, first, *counts, *places)
-        library.launch(launch)
-        return launch.colors
+        colors = Buffers(self.workspace, seen.device).floats("gathered_colors", sum(counts), 3)
+        library.launch(launches.GatherColors(colors, list(counts), first, seen, self.overflow, list(parts)))
+        return colors
 
     def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel.

@@ -85,6 +85,7 @@ class Workspace:
 
     Attributes:
         status: [2] int32 on the device, of `layout.PassStatus`: intersections of the latest pass; the overflow flag.
+        overflow: [1] int32 of `status`, not 0 while passes do nothing. Kernels that change state must check it.
         passes: number of passes begun.
     """
 
@@ -105,12 +106,7 @@ class Workspace:
         self._first_lost: int | None = None
 
     def _set_status(self, status: Tensor) -> None:
-        self.status, self._overflow = status, status[PassStatus.OVERFLOW :]
-
-    @property
-    def overflow(self) -> Tensor:
-        """[1] int32 on the device, not 0 while passes do nothing. Kernels that change state must check it."""
-        return self._overflow
+        self.status, self.overflow = status, status[PassStatus.OVERFLOW :]
 
     def buffer(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """The buffer of this name, uninitialised; it grows if needed."""
@@ -123,8 +119,7 @@ class Workspace:
             self._views.pop(name, None)
             self._buffers.pop(name, None)  # freed before its successor is made
             held = self._buffers[name] = torch.empty(int(count * GROWTH) + 1, dtype=dtype, device=self.device)
-        strides = [math.prod(shape[place + 1 :]) for place in range(len(shape))]
-        view = self._views[name] = held.as_strided(shape, strides)  # in one operation
+        view = self._views[name] = held[:count].view(shape)
         return view
 
     def lend(self, memory: PassMemory | None) -> None:

@@ -15,6 +15,3 @@ class ReferenceEngine(SharedEngine):
     render = staticmethod(rasterize_reference)
     screen_gradients = staticmethod(screen_gradients)
     evaluate = staticmethod(sparse_loss)
-
-    def recover(self) -> None:
-        """Nothing is kept, so there is nothing to clear."""
