@@ -4,7 +4,7 @@ import pytest
 import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
-from turbogs_plugin.engine.reference.engine import ReferenceEngine
+from turbogs_plugin.engine import ReferenceEngine
 from turbogs_plugin.engine.reference.raster import kept
 from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.engine.render_pass import RenderOptions

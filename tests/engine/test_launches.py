@@ -14,11 +14,10 @@ import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin import engine
-from turbogs_plugin.engine import layout
+from turbogs_plugin.engine import ReferenceEngine, layout
 from turbogs_plugin.engine.cuda import launches, library, raster
 from turbogs_plugin.engine.cuda.training import view_rows
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS
 from turbogs_plugin.engine.rules import LossTerms, ParameterRates
 from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, LossOutput, PixelSamples

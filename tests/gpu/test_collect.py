@@ -6,11 +6,11 @@ import pytest
 import torch
 from helpers.raster_cases import GPU_ONLY, make_case
 
+from turbogs_plugin.engine import ReferenceEngine
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda.engine import CudaEngine
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
-from turbogs_plugin.engine.reference.engine import ReferenceEngine
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, ScreenRecords
 from turbogs_plugin.engine.shared import PassMemory
 

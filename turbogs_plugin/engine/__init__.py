@@ -13,10 +13,24 @@ import torch
 from turbogs_plugin.engine.cuda import library
 from turbogs_plugin.engine.cuda.engine import CudaEngine
 from turbogs_plugin.engine.protocol import Engine
-from turbogs_plugin.engine.reference.engine import ReferenceEngine
+from turbogs_plugin.engine.reference.draws import draw_pixels
+from turbogs_plugin.engine.reference.losses import sparse_loss
+from turbogs_plugin.engine.reference.raster import rasterize_reference, screen_gradients
 from turbogs_plugin.engine.shared import SharedEngine
 
-__all__ = ["Engine", "engine_of", "library"]
+__all__ = ["Engine", "ReferenceEngine", "engine_of", "library"]
+
+
+class ReferenceEngine(SharedEngine):
+    """`Engine` in torch, the definition of every result, on any device and in float32 or float64.
+
+    It keeps nothing between calls and never loses an iteration.
+    """
+
+    draw = staticmethod(draw_pixels)
+    render = staticmethod(rasterize_reference)
+    screen_gradients = staticmethod(screen_gradients)
+    evaluate = staticmethod(sparse_loss)
 
 
 def engine_of(device: torch.device, for_training: bool = False) -> SharedEngine:

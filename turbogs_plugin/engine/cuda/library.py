@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import torch
 
@@ -60,20 +60,14 @@ def unavailable_reason() -> str:
         return failure
     if not torch.cuda.is_available():
         return "torch sees no CUDA device"
+    for cls in launches.LAUNCHES:
+        setattr(operators, cls.operator, getattr(torch.ops.turbogs, cls.operator).default)  # the only overload
     return _mismatch(architectures(), torch.cuda.get_device_capability())
 
 
-class _Operators:
-    """The library's operators as attributes, each kept: to look one up for each launch takes a third of the call."""
-
-    def __getattr__(self, name: str) -> Callable[..., None]:
-        operator = getattr(torch.ops.turbogs, name).default  # the only overload
-        setattr(self, name, operator)
-        return operator
-
-
-operators = _Operators()
-"""What `launch` calls. A recorder of launches puts its own functions here."""
+operators = SimpleNamespace()
+"""What `launch` calls, by name, once the library is known to run: to look an operator up takes a third of a call. A
+recorder of launches puts its own functions here."""
 
 
 def launch(arguments: launches.Launch) -> None:
