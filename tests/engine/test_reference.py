@@ -336,7 +336,7 @@ def test_negative_exponents_are_skipped():
     centers = torch.tensor([[[1.0, 1.0], [1.0, -1.0], [0.0, 0.0]]], dtype=torch.float64)
     means, conic = torch.zeros(1, 2, dtype=torch.float64), torch.tensor([[1.0, 2.0, 1.0]], dtype=torch.float64)
     ones = torch.ones(1, dtype=torch.float64)
-    table = compositing.splat_table(means, conic, ones.expand(1, 3), 0.5 * ones, ones)
+    table = torch.cat([means, conic, 0.5 * ones[:, None], ones.expand(1, 3), ones[:, None]], dim=1).T
     row = torch.zeros(1, 1, dtype=torch.int64)
     start = torch.ones(1, 3, 1, dtype=torch.float64)
     piece = compositing.composite_slice(table, row, row == 0, centers, start, RasterSettings())

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.reference import compositing
-from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Compositor
+from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Compositor, splat_table
 from turbogs_plugin.engine.reference.intersection import intersect_tiles
 from turbogs_plugin.engine.reference.philox import PURPOSE_DROPOUT, random_words
 from turbogs_plugin.engine.reference.projection import Rows, Splats, drawable_rows, project_rows
@@ -96,7 +95,6 @@ class ReferenceRendered(Rendered):
     """One forward pass (see `Rendered`)."""
 
     _sums: Tensor = field(repr=False)
-    _table: Tensor = field(repr=False)
     _compositor: Compositor = field(repr=False)
     _rows: Rows = field(repr=False)
     _splats: Splats = field(repr=False)
@@ -125,9 +123,7 @@ class ReferenceRendered(Rendered):
             to_alpha = to_alpha - given["color_gradients"].to(self._background) @ self._background
         columns = [given["color_gradients"], to_alpha[:, None], divided[:, None]]
         gradients = torch.cat(columns, dim=1).to(self._sums.dtype)
-        records = compositing.composite_backward(
-            self._compositor, self._table, self._sums, gradients, given["pixel_errors"]
-        )
+        records = self._compositor.backward(self._sums, gradients, given["pixel_errors"])
         return ReferenceScreenGradients(self._rows, self._splats, self._leaves, records, self._compositor.samples)
 
 
@@ -139,15 +135,15 @@ def rasterize_reference(
     stay = kept(options.dropout, len(gaussians), gaussians.device)
     rows, leaves, splats = _projected(gaussians, cameras, options, None if stay is None else stay[:, None])
     with torch.no_grad():
-        compositor = Compositor(intersect_tiles(rows, splats, samples, settings), samples, settings)
-        table = compositing.splat_table(splats.means2d, splats.conics, splats.colors, splats.opacities, splats.depths)
-        sums = compositing.composite(compositor, table)
+        table = splat_table(splats)
+        compositor = Compositor(intersect_tiles(rows, splats, samples, settings), samples, settings, table)
+        sums = compositor.forward()
         depths = sums[:, 4] / sums[:, 3].clamp(min=ALPHA_TINY) if options.with_depth else None
         colors, background = sums[:, :3], None
         if any(options.background):
             background = sums.new_tensor(options.background)
             colors = colors + (1.0 - sums[:, 3:4]) * background
-    return ReferenceRendered(colors, sums[:, 3], depths, sums, table, compositor, rows, splats, leaves, background)
+    return ReferenceRendered(colors, sums[:, 3], depths, sums, compositor, rows, splats, leaves, background)
 
 
 def kept(dropout: Dropout, count: int, device: torch.device) -> Tensor | None:
