@@ -360,8 +360,6 @@ def test_settings_are_used():
         {"eps2d": np.inf},
         {"near_plane": 0.0},
         {"near_plane": np.nan},
-        {"near_plane": 2.0, "far_plane": 2.0},
-        {"far_plane": np.nan},
         {"transmittance_min": 0.0},
         {"transmittance_min": 1.0},
     ],

@@ -153,7 +153,7 @@ class InPlace:
         assert self._passes is not None, "prepare says that there is no memory"
         memory, lent = self._passes
         if self._ranks.asked:
-            lent.stop.fill_(self._ranks.asked)
+            lent.status[PassStatus.STOP].fill_(self._ranks.asked)
         memory.barrier(WRITTEN)
         return engine.gather(memory.parts, self._starts[1], [share.num_slots for share in shares], seen)
 

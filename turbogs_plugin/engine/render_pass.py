@@ -145,7 +145,7 @@ class RasterSettings:
 
     Args:
         eps2d: blur, added to the diagonal of the projected covariance, pixels squared; 0 or more.
-        near_plane, far_plane: depths outside are not drawn, world units; 0 < near_plane < far_plane.
+        near_plane, far_plane: depths outside are not drawn, world units; near_plane above 0.
         transmittance_min: transmittance of a pixel that ends it, before the splat that would bring it to this or below;
             between 0 and 1. The only one that a configuration sets.
 
@@ -167,8 +167,6 @@ class RasterSettings:
     def __post_init__(self) -> None:
         require(0 <= self.eps2d < math.inf, "eps2d", self.eps2d, "finite and at least 0")
         require(self.near_plane > 0, "near_plane", self.near_plane, "above 0")
-        beyond = f"above near_plane = {self.near_plane!r}"
-        require(self.far_plane > self.near_plane, "far_plane", self.far_plane, beyond)
         require(0 < self.transmittance_min < 1, "transmittance_min", self.transmittance_min, "between 0 and 1")
 
 

@@ -38,11 +38,6 @@ class PassMemory:
     radii: Tensor
     records: Tensor
 
-    @cached_property
-    def stop(self) -> Tensor:
-        """[1] int32 of `status`."""
-        return self.status[PassStatus.STOP :][:1]
-
 
 @dataclass
 class ModelCopies:

@@ -9,7 +9,7 @@ a view or with more than `MAX_VIEWS`, raises `RuntimeError`, which names the ten
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -57,8 +57,9 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     chosen, slots, draws = _places(rule, ends, tiles, live_starts)
     scratch = launches.NO_SCRATCH
     if by_tile:
-        dtypes = (torch.float64, torch.int32, torch.int64, torch.float32)
-        scratch = launches.TileScratch(*(torch.empty(sum(tiles), dtype=dtype, device=device) for dtype in dtypes))
+        dtypes = {"errors": torch.float64, "ages": torch.int32, "keys": torch.int64, "missed": torch.float32}
+        empty = partial(torch.empty, sum(tiles), device=device)
+        scratch = SimpleNamespace(**{f"tile_{name}": empty(dtype=dtype) for name, dtype in dtypes.items()})
     parts = slots, chosen, chosen + 1
     memory = torch.empty(sum(parts), dtype=torch.int32, device=device)  # in less of the host's time than three tensors
     pixel_ids, tile_ids, tile_offsets = memory.split_with_sizes(parts)

@@ -20,6 +20,7 @@ from .base import LAUNCHES, Launch, field_types, fields_of, nested_type
 
 if TYPE_CHECKING:
     from types import SimpleNamespace as Copies
+    from types import SimpleNamespace as TileScratch
 
     from torch import Tensor
 
@@ -42,6 +43,7 @@ else:  # the fields that launches read of these
     Dropout = fields_of(int="threshold seed iteration")
     Upstream = fields_of(Tensor="color_gradients alpha_gradients depth_gradients pixel_errors")
     GaussianMoments = fields_of(Tensor="exp_avg exp_avg_sq exp_avg_shN exp_avg_sq_shN steps skipped")
+    TileScratch = fields_of(Tensor="tile_errors tile_ages tile_keys tile_missed")  # by tile of the batch
     Copies = fields_of(int="copy_0 copy_1 copy_2 copy_3 copy_4 copy_5 copy_6")
     ParameterRates = fields_of(float="means quats scales opacities sh0 shN")
     PixelMasks = fields_of(Tensor="tiles rows bits")  # [L] int32, [L] int32, [B, 8] int32
@@ -54,8 +56,10 @@ __all__ = ["LAUNCHES", "Launch", "field_types", "nested_type"]
 NO_COPIES: Any = SimpleNamespace(**dict.fromkeys(Copies.__annotations__, 0))
 NO_STATS: Any = SimpleNamespace(**dict.fromkeys(GaussianStats.__annotations__))
 NO_MASKS: Any = SimpleNamespace(**dict.fromkeys(PixelMasks.__annotations__))
+NO_SCRATCH: Any = SimpleNamespace(**dict.fromkeys(TileScratch.__annotations__))
 NO_MAPS: Any = SimpleNamespace(**dict.fromkeys(ErrorMaps.__annotations__))
-"""Arguments of a launch that changes no copies, adds to no statistics, counts every pixel, updates no maps."""
+"""Arguments of a launch that changes no copies, adds to no statistics, counts every pixel, draws no tiles, updates no
+maps."""
 
 
 @dataclass
@@ -231,20 +235,6 @@ class FusedStep(Launch):
 
 
 @dataclass
-class TileScratch:
-    """Scratch for unit = tile: an entry for each tile of the batch."""
-
-    tile_errors: Tensor | None  # float64
-    tile_ages: Tensor | None  # int32
-    tile_keys: Tensor | None  # int64
-    tile_missed: Tensor | None  # float32
-
-
-NO_SCRATCH = TileScratch(None, None, None, None)
-"""Scratch of a draw of single pixels: none."""
-
-
-@dataclass
 class SamplePixels(Launch):
     """Draw samples: writes the tensors of `samples`."""
 
@@ -261,7 +251,7 @@ class SamplePixels(Launch):
     iteration: int
     now: int  # a stamp's age is `now` less the stamp
     samples: PixelSamples  # weights are None without importance
-    scratch: TileScratch
+    scratch: TileScratch  # float64, int32, int64 and float32; None for unit = pixel
 
 
 @dataclass
