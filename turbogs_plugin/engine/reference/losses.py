@@ -220,7 +220,9 @@ def window_similarity(
     Returns:
         S and h, [P, 3] each.
     """
-    places = _pixel_places(samples, groups.tile_of_slot)
+    inside = (samples.coordinates() + torch.tensor(samples.origin, device=samples.pixel_ids.device)) % TILE_SIZE
+    # [P] the place of each slot among the pixels of all T tiles, row by row in a tile; in empty slots any
+    places = (groups.tile_of_slot * TILE_SIZE + inside[:, 1]) * TILE_SIZE + inside[:, 0]
     first_x, first_y = groups.spread(colors[groups.first_slots]), groups.spread(targets[groups.first_slots])  # [P, 3]
     x, y = colors - first_x, targets - first_y
 
@@ -249,12 +251,6 @@ def window_similarity(
     terms = torch.cat([at_y, at_x, constant - at_y * mean_y + at_x * mean_x], dim=1) * inverse_totals
     sum_y, sum_x, rest = windows(terms).chunk(3, dim=1)
     return structure * luminance, sum_y * y - sum_x * x + rest
-
-
-def _pixel_places(samples: PixelSamples, tile_of_slot: Tensor) -> Tensor:
-    """[P] int64: the place of each slot among the pixels of all T tiles, row by row in a tile; in empty slots any."""
-    inside = (samples.coordinates() + torch.tensor(samples.origin, device=samples.pixel_ids.device)) % TILE_SIZE
-    return (tile_of_slot * TILE_SIZE + inside[:, 1]) * TILE_SIZE + inside[:, 0]
 
 
 def _sum_windows(values: Tensor, places: Tensor, tiles: int) -> Tensor:
