@@ -56,17 +56,6 @@ class Exposures:
         offsets, exp_avg, exp_avg_sq = torch.zeros(3, views, 3, 4, device=device).unbind()
         return cls(offsets, exp_avg, exp_avg_sq, torch.zeros(views, dtype=torch.int32, device=device))
 
-    @classmethod
-    def of_gains(cls, gains: Tensor, device: torch.device | str) -> Exposures:
-        """Exposures of photos that were never updated, but are known to differ by gains.
-
-        Args:
-            gains: [V, 3] of the channels, in stops: factors of 2.
-        """
-        exposures, factors = cls.identity(len(gains), device), 2.0 ** gains.double()  # [V, 3]
-        exposures.offsets[:, range(3), range(3)] = (factors / factors.mean(dim=0) - 1.0).to(exposures.offsets)
-        return exposures
-
     def state_dict(self) -> dict[str, Any]:
         return dict(vars(self))
 

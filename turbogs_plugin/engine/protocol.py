@@ -19,15 +19,7 @@ from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, Rendered, RenderO
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.types import (
-    Cameras,
-    Gaussians,
-    GaussianStats,
-    LossOutput,
-    PixelSamples,
-    RowUpdate,
-    Step,
-)
+from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
 
 @dataclass(frozen=True)

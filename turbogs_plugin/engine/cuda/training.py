@@ -28,16 +28,7 @@ from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.engine.shared import ModelCopies
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds
-from turbogs_plugin.types import (
-    BLACK,
-    Color,
-    Gaussians,
-    GaussianStats,
-    LossOutput,
-    PixelSamples,
-    Step,
-    TileGrid,
-)
+from turbogs_plugin.types import BLACK, Color, Gaussians, GaussianStats, LossOutput, PixelSamples, Step, TileGrid
 
 
 def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:

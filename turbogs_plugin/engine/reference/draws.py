@@ -47,13 +47,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.reference.philox import (
-    PURPOSE_PIXELS,
-    PURPOSE_TILES,
-    Words,
-    exponentials,
-    random_words,
-)
+from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, PURPOSE_TILES, Words, exponentials, random_words
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds, compact, pixel_table, slots_of_tiles
