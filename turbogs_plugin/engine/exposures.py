@@ -19,12 +19,9 @@ from torch import Tensor
 from turbogs_plugin.engine.moments import check_state
 from turbogs_plugin.types import PixelSamples, Step, on_device
 
-FIRST_RATE = 3e-3
-LAST_RATE = 3e-4
+FIRST_RATE, LAST_RATE = 3e-3, 3e-4
 """Adam's rates at the start and the end of a run, a third of 3DGS's for exposures. Not yet measured."""
-BETA1 = 0.9
-BETA2 = 0.999
-EPSILON = 1e-15
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 PULL = 0.01
 """Weight of ``mean over the views of a batch of (|A|^2 + |b|^2) / 2`` in the objective. A photo at half the exposure
 has A = -0.5, which the term pulls back with .005, and a photo's error in colour pulls with up to a third of the mean

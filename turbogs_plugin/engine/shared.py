@@ -66,7 +66,16 @@ class ModelCopies:
 
 
 def collect_records(sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
-    """`Engine.collect`. Where a Gaussian is off screen, this copies as well what the sources' records hold."""
+    """Collect the records of all K views for some rows. What several processes have of one view is added up, in
+    their order.
+
+    Args:
+        sources: of each process with views, in their order: of V views and N Gaussians; maybe other devices'
+            memory, read in place.
+        views: first view of each, in the batch: the last one of the process before, or the next.
+        target: of K views and M Gaussians; overwritten, but where off screen an engine may leave what is there.
+        row: first of the M among the N.
+    """
     rows, end = slice(row, row + target.records.shape[1]), 0
     for source, view in zip(sources, views, strict=True):
         if view < end:  # shared with the process before
@@ -103,18 +112,7 @@ class SharedEngine(Engine):
             for name, value in copy.items():
                 value.copy_(getattr(gaussians, name))
 
-    def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
-        """Collect the records of all K views for some rows. What several processes have of one view is added up, in
-        their order.
-
-        Args:
-            sources: of each process with views, in their order: of V views and N Gaussians; maybe other devices'
-                memory, read in place.
-            views: first view of each, in the batch: the last one of the process before, or the next.
-            target: of K views and M Gaussians; overwritten, but for records that are off screen.
-            row: first of the M among the N.
-        """
-        collect_records(sources, views, target, row)
+    collect = staticmethod(collect_records)
 
     def lend(self, memory: PassMemory | None) -> bool:
         """Let the following passes keep in this memory what it is for, as far as it fits in. None: in the engine's own.

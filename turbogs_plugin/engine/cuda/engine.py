@@ -22,7 +22,7 @@ from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, RenderOptions, Sc
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.engine.shared import PassMemory, SharedEngine
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.types import BLACK, Cameras, Gaussians, LossOutput, PixelSamples
+from turbogs_plugin.types import Cameras, Gaussians, LossOutput, PixelSamples
 
 
 class CudaEngine(SharedEngine):
@@ -86,8 +86,7 @@ class CudaEngine(SharedEngine):
     def evaluate_and_learn(
         self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
     ) -> LossOutput:
-        shared = self.overflow, BLACK, self.workspace
-        return training.sparse_loss(terms, colors, targets, samples, update, *shared)
+        return training.sparse_loss(terms, colors, targets, samples, update, self.overflow, workspace=self.workspace)
 
     def settle(self, wait: bool = False) -> int:
         return 0 if self.workspace is None else self.workspace.take_lost(wait)

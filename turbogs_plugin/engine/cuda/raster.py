@@ -258,8 +258,7 @@ def rasterize_cuda(
     num_tiles, num_active = len(samples.grid), len(samples.tile_ids)
 
     # A pass over every tile needs no table of the active ones.
-    everywhere = num_active == num_tiles
-    tile_ids = None if everywhere else samples.tile_ids.contiguous()
+    tile_ids = None if num_active == num_tiles else samples.tile_ids.contiguous()
     splats, tiles, block_sums, records = buffers.kept("front", _front_arrays, views, count, num_active, num_tiles)
     grid = launches.GridOrigin(*samples.origin)
     arrays = (splats, tile_ids, tiles.tile_cursors, records)

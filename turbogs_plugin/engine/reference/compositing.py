@@ -55,10 +55,6 @@ class Compositor:
     settings: RasterSettings
     table: Tensor
 
-    @property
-    def device(self) -> torch.device:
-        return self.intersections.rows.device
-
     def blocks(self) -> Iterator[Block]:
         """All tiles that have both samples and intersections, those with the most intersections first."""
         tile_counts = self.intersections.tile_counts
@@ -68,7 +64,7 @@ class Compositor:
         sample_counts, sample_starts = offsets.diff()[order], offsets[:-1][order]
         host_sample_counts = sample_counts.tolist()
         starts = (tile_counts.cumsum(0) - tile_counts)[order]
-        limit = BLOCK_ELEMENTS[self.device.type]
+        limit = BLOCK_ELEMENTS[self.table.device.type]
 
         begin = 0
         while begin < len(counts) and counts[begin] > 0:
@@ -78,7 +74,7 @@ class Compositor:
                 if end > begin and (end + 1 - begin) * most * min(depth, SLICE_SPLATS) > limit:
                     break
                 most_samples, end = most, end + 1
-            number = torch.arange(most_samples, device=self.device)
+            number = torch.arange(most_samples, device=self.table.device)
             slots = sample_starts[begin:end, None] + number
             slots = slots.masked_fill_(number >= sample_counts[begin:end, None], len(self.samples))
             yield Block(slots, starts[begin:end], device_counts[begin:end], depth)
@@ -96,7 +92,7 @@ class Compositor:
             block_centers = centers[block.samples]  # [B, S, 2]
             transmittance = torch.ones_like(block_centers[:, :, :1])
             for first in range(0, block.depth, SLICE_SPLATS):
-                number = torch.arange(first, min(first + SLICE_SPLATS, block.depth), device=self.device)
+                number = torch.arange(first, min(first + SLICE_SPLATS, block.depth), device=self.table.device)
                 real = number < block.count[:, None]
                 numbers = torch.where(real, block.start[:, None] + number, 0)
                 rows = self.intersections.rows[numbers]

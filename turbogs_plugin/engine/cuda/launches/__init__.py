@@ -58,8 +58,7 @@ NO_STATS: Any = SimpleNamespace(**dict.fromkeys(GaussianStats.__annotations__))
 NO_MASKS: Any = SimpleNamespace(**dict.fromkeys(PixelMasks.__annotations__))
 NO_SCRATCH: Any = SimpleNamespace(**dict.fromkeys(TileScratch.__annotations__))
 NO_MAPS: Any = SimpleNamespace(**dict.fromkeys(ErrorMaps.__annotations__))
-"""Arguments of a launch that changes no copies, adds to no statistics, counts every pixel, draws no tiles, updates no
-maps."""
+"""Arguments of a launch without copies, statistics, masks, tiles to draw, or maps."""
 
 
 @dataclass
