@@ -15,10 +15,6 @@ from turbogs_plugin.strategies.density.growth import TINY, drawn_by_squares
 from turbogs_plugin.types import GaussianStats, Step
 
 COUNT = 40
-SHARE = 2
-"""5 % of `COUNT`."""
-
-
 # ---- Few Gaussians, and caps ---------------------------------------------------------------------------------------
 
 
@@ -180,16 +176,6 @@ def test_the_unit_of_the_world_does_not_choose(scale):
     update = event(gaussians, stats, replace(EVENT, scene_extent=scale * EVENT.scene_extent), **settings)
     assert torch.equal(update.source, expected.source) and update.num_split == expected.num_split
     assert len(removed(update, COUNT)) > 4 and len(grown(update)) > 5
-
-
-@pytest.mark.parametrize(("factor", "passing"), [(1e-6, 0), (0.5, 0), (1.0, COUNT), (1e6, COUNT)])
-def test_the_gate_of_the_gradient_is_absolute(factor, passing):
-    """The draw has no unit, but how many grow has: below the threshold nobody does, and turnover goes on."""
-    stats = window(factor**2 * spread_squares(COUNT))
-    stats.absgrad_sums *= factor
-    update = event(small_model(COUNT), stats)
-    assert len(removed(update, COUNT)) == SHARE
-    assert len(grown(update)) == max(0, passing - SHARE)
 
 
 # ---- Many events ---------------------------------------------------------------------------------------------------

@@ -206,19 +206,6 @@ def test_a_view_masked_whole(variant, tmp_path):
     trainer.require_finite()
 
 
-def test_points_that_no_camera_sees(variant, tmp_path):
-    """Nothing to see, nothing to learn: the run goes on to its end and changes nothing."""
-
-    def change(reconstruction: pycolmap.Reconstruction) -> None:
-        for point in reconstruction.points3D.values():
-            point.xyz = point.xyz + np.array([0.0, 0.0, 1000.0])
-
-    edit_model(variant, change)
-    outcome = train_to_the_end(variant, tmp_path / "run")
-    assert outcome.history[-1].psnr == outcome.history[0].psnr
-    assert outcome.history[-1].num_gaussians == outcome.history[0].num_gaussians
-
-
 # ---- Settings ----------------------------------------------------------------------------------------------------
 
 
