@@ -89,7 +89,7 @@ def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
     shutil.copy(finished / "config.yaml", tmp_path / "run")
     choice, refused, cases = random.Random(3), 0, 0
     for path, _ in list(leaves(state)):
-        for _ in range(3):
+        for _ in range(2):
             changed = with_other_places(state)
             parent = changed
             for key in path[:-1]:
@@ -108,7 +108,7 @@ def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
                 run.resume(tmp_path / "run")
             except InputError:
                 refused += 1
-    assert cases > 80 and refused > 0.6 * cases
+    assert cases > 50 and refused > 0.6 * cases
 
 
 # ---- Text --------------------------------------------------------------------------------------------------------

@@ -15,6 +15,8 @@ from turbogs_plugin.strategies.density.growth import TINY, drawn_by_squares
 from turbogs_plugin.types import GaussianStats, Step
 
 COUNT = 40
+
+
 # ---- Few Gaussians, and caps ---------------------------------------------------------------------------------------
 
 

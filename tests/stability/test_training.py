@@ -124,14 +124,12 @@ PHOTOS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("name", "loss"),
-    [(name, "charbonnier_ncc") for name in PHOTOS] + [("one colour", "sparse_ssim"), ("exposures", "sparse_ssim")],
-)
-def test_photos_without_information(variant, tmp_path, name, loss, drawn):
+@pytest.mark.parametrize("name", ["black", "one colour", "exposures", "noise"])
+def test_photos_without_information(variant, tmp_path, name, drawn):
     edit_photos(variant, PHOTOS[name])
+    loss = "sparse_ssim" if name in ("one colour", "exposures") else "charbonnier_ncc"
     outcome = train_to_the_end(variant, tmp_path / "run", f"loss.type={loss}")
-    if name in ("black", "white", "one colour"):
+    if name in ("black", "one colour"):
         assert outcome.history[-1].psnr > outcome.history[0].psnr
 
 
