@@ -78,7 +78,6 @@ class CharbonnierNccLoss(RuleLoss):
             structure=self.structure,
             structure_weight=self.ncc_weight,
             variance_constant=self.variance_constant,
-            balance=True,
         )
 
 

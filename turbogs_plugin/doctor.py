@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 import torch
 from packaging.requirements import Requirement
 
-from turbogs_plugin.engine import compiled_kernels
+from turbogs_plugin.engine import library
 from turbogs_plugin.report.provenance import hardware, missing_bytecode, software
 from turbogs_plugin.train.perceptual import LPIPS_PACKAGES, load_flip
 from turbogs_plugin.viewer.server import INSTALL as INSTALL_VIEWER
@@ -32,9 +32,11 @@ INSTALL_COMMANDS = 'pip install "turbogs-plugin[train]"'
 
 def diagnosis() -> str:
     """Versions, devices, kernels and what is missing, for a person to read."""
-    kernels = compiled_kernels()
-    missing = [f"kernels: {kernels.unavailable}"] if kernels.unavailable else []
-    usable = "not usable" if missing else f"loaded from {kernels.path}, for {', '.join(kernels.architectures)}"
+    reason = library.unavailable_reason()
+    missing = [f"kernels: {reason}"] if reason else []
+    usable = (
+        "not usable" if reason else f"loaded from {library.library_path()}, for {', '.join(library.architectures())}"
+    )
     lines = [f"{name:<16}{version}" for name, version in software()]
     lines += [f"{'machine':<16}{hardware('cuda' if torch.cuda.is_available() else 'cpu')}"]
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0

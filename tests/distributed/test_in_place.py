@@ -22,7 +22,7 @@ from turbogs_plugin.distributed.messages import rows_of
 from turbogs_plugin.distributed.peer_memory import PeerMemory, aligned_starts, share_memory
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.ranks_engine import RanksEngine
-from turbogs_plugin.engine.reference.engine import ReferenceEngine
+from turbogs_plugin.engine import ReferenceEngine
 from turbogs_plugin.engine.shared import ModelCopies, SharedEngine
 from turbogs_plugin.model.torch_file import leaves
 from turbogs_plugin.train.loop import TrainingLoop

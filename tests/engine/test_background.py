@@ -4,8 +4,8 @@ import pytest
 import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians, thin_out
 
-from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.render import dense_samples, rasterize, render_image
+from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
 from turbogs_plugin.types import PARAMETER_NAMES
 
 SIZES = [(37, 29), (20, 50)]

@@ -5,7 +5,7 @@ import pytest
 import torch
 from helpers.rendering_scenes import dense_on_grid, make_cameras, make_gaussians, thin_out
 
-from turbogs_plugin.engine.reference.intersection import intersect_tiles, smallest_exponents, spread
+from turbogs_plugin.engine.reference.intersection import intersect_tiles, smallest_exponents
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
 from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.engine.render_pass import RasterSettings
@@ -92,18 +92,3 @@ def test_intersections_cover_every_row_once_when_summed():
     counts = torch.bincount(intersections.rows, minlength=len(splats.depths))
     expected = counts * torch.arange(1, len(counts) + 1)
     assert torch.equal(intersections.sum_by_row(values)[:, 0], expected.double())
-
-
-def test_equal_depths_keep_the_order_of_the_gaussians():
-    gaussians, cameras = make_gaussians(40, degree=0), make_cameras([(32, 32)])
-    gaussians.means[:] = gaussians.means[0]
-    rows, splats, intersections = intersections_of(gaussians, cameras, dense_samples(cameras))
-    assert len(set(splats.depths.tolist())) == 1
-    for listed in intersections.rows.split(intersections.tile_counts.tolist()):
-        assert (rows.gaussians[listed].diff() > 0).all()
-
-
-def test_spread():
-    owners, number = spread(torch.tensor([2, 0, 3]))
-    assert owners.tolist() == [0, 0, 2, 2, 2]
-    assert number.tolist() == [0, 1, 0, 1, 2]

@@ -14,28 +14,19 @@ import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin import engine
-from turbogs_plugin.engine import layout
+from turbogs_plugin.engine import ReferenceEngine, layout
 from turbogs_plugin.engine.cuda import launches, library, raster
 from turbogs_plugin.engine.cuda.training import view_rows
-from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.reference.engine import ReferenceEngine
+from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS
 from turbogs_plugin.engine.rules import LossTerms, ParameterRates
-from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, PixelSamples
+from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, LossOutput, PixelSamples
 
 CSRC = Path(__file__).resolve().parents[2] / "csrc"
 LISTS = ("Tensors", "Integers", "Reals")
 ROWS = [value for value in vars(layout).values() if isinstance(value, type)]
-OBJECTS = {
-    "GaussianArrays": Gaussians,
-    "StatSums": GaussianStats,
-    "Moments": GaussianMoments,
-    "Rates": ParameterRates,
-    "SampleArrays": PixelSamples,
-    "LossSettings": LossTerms,
-    "ExposureArrays": Exposures,
-}
-"""What stands for the protocols of `launches`."""
+OBJECTS = (Gaussians, GaussianStats, GaussianMoments, ParameterRates, PixelSamples, LossTerms, LossOutput)
+"""Classes of the package whose fields launches read, by the names that `launches` has for them."""
 
 
 @pytest.fixture(scope="module")
@@ -119,10 +110,10 @@ def test_the_bindings_read_every_field(cls):
 
 
 def test_the_objects_of_the_package_have_the_fields_that_launches_read():
-    for name, cls in OBJECTS.items():
-        wanted = getattr(launches, name).__annotations__
-        assert set(wanted) <= {field.name for field in dataclasses.fields(cls)}, name
-    for empty, name in ((launches.NO_STATS, "StatSums"), (launches.NO_MAPS, "MapArrays")):
+    for cls in OBJECTS:
+        wanted = getattr(launches, cls.__name__).__annotations__
+        assert set(wanted) <= {field.name for field in dataclasses.fields(cls)} | {*dir(cls)}, cls
+    for empty, name in ((launches.NO_STATS, "GaussianStats"), (launches.NO_MAPS, "ErrorMaps")):
         assert vars(empty) == dict.fromkeys(getattr(launches, name).__annotations__)
 
 
@@ -172,7 +163,7 @@ def test_rows_of_views_are_what_the_layout_says():
 def test_selected_cameras_are_read_from_the_memory_of_all():
     """Nothing is stacked for a launch, which names the row of each view's camera."""
     cameras, gaussians = make_cameras([(40, 30), (20, 21), (30, 50)], torch.float32), make_gaussians(4)
-    scene = raster._scene(gaussians, cameras.select([2, 0]), sh_degree=1, eps2d=0.3)
+    scene = raster.scene_of(gaussians, cameras.select([2, 0]), DEFAULT_OPTIONS)
     assert scene.viewmats.data_ptr() == cameras.viewmats.data_ptr() and scene.viewmats.shape == (3, 4, 4)
     assert scene.Ks.data_ptr() == cameras.Ks.data_ptr() and scene.images == [30, 50, 2, 40, 30, 0]
     assert len(scene.images) == 2 * layout.ImageRow.SIZE and scene.images[layout.ImageRow.CAMERA] == 2
@@ -186,7 +177,7 @@ def loaded(monkeypatch, tmp_path):
     monkeypatch.setenv(library.LIBRARY_VARIABLE, str(path))
     monkeypatch.setattr(torch.ops, "load_library", lambda path: None)
     library._load_failure.cache_clear()
-    yield lambda text: monkeypatch.setattr(library, "_interface", lambda: text)
+    yield lambda text: monkeypatch.setattr(torch.ops.turbogs, "interface", lambda: text, raising=False)
     library._load_failure.cache_clear()
 
 

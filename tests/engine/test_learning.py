@@ -65,16 +65,3 @@ def test_a_colour_that_is_not_finite_leaves_its_pixel_alone(case, loss, bad):
     assert torch.equal(maps.errors[kept], before["errors"][kept])
     assert torch.equal(maps.stamps == STEP.iteration, ~kept)
     assert float(maps.view_sums[1]) == pytest.approx(float(maps.errors[21 * 17 :].double().sum()), rel=1e-12)
-
-
-def test_supervising_is_evaluating_and_learning(case):
-    maps, truth = case
-    loss, colors = CharbonnierNccLoss(), torch.rand(256, 3, generator=torch.Generator().manual_seed(4))
-    other = ErrorMaps(SIZES)
-    other.load_state_dict(maps.state_dict())
-    engine = engine_of(colors.device)
-    whole = engine.supervise(loss.terms, colors, truth, MapUpdate(maps, STEP))
-    parts = loss(colors, truth.colors(), truth.samples)
-    engine.learn(truth.samples, colors, parts, MapUpdate(other, STEP))
-    assert all(torch.equal(getattr(whole, name), getattr(parts, name)) for name in vars(parts))
-    assert all(torch.equal(maps.state_dict()[name], other.state_dict()[name]) for name in MAPS)

@@ -9,7 +9,7 @@ from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_cova
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows, rotation_matrices
-from turbogs_plugin.engine.reference.spherical_harmonics import basis, evaluate, num_bands, unit_directions
+from turbogs_plugin.engine.reference.spherical_harmonics import evaluate, unit_directions
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.types import Gaussians
 
@@ -29,18 +29,6 @@ def test_spherical_harmonics_are_gsplats(degree):
     ours = evaluate(coefficients[:, :1], coefficients[:, 1:], unit_directions(offsets), degree)
     theirs = _spherical_harmonics(degree, offsets, coefficients)
     torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-13)
-
-
-def test_spherical_harmonics_are_orthonormal():
-    """Integrals over the sphere by Gauss-Legendre in z and the trapezoid rule in the angle, exact at these degrees."""
-    heights, weights = np.polynomial.legendre.leggauss(8)
-    angles = 2 * np.pi * np.arange(16) / 16
-    z, angle = np.meshgrid(heights, angles, indexing="ij")
-    ring = np.sqrt(1 - z**2)
-    directions = torch.tensor(np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=-1).reshape(-1, 3))
-    values = basis(directions, 3).numpy()
-    area = np.repeat(weights, 16) * 2 * np.pi / 16
-    np.testing.assert_allclose(values.T @ (area[:, None] * values), np.eye(num_bands(3)), atol=1e-9)
 
 
 def test_direction_of_no_offset_is_zero_with_no_gradient():

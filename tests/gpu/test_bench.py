@@ -15,7 +15,7 @@ from turbogs_plugin.engine.cuda import library as kernels
 
 pytestmark = [
     pytest.mark.gpu,
-    pytest.mark.skipif(not kernels.available(), reason=kernels.unavailable_reason() or "available"),
+    pytest.mark.skipif(bool(kernels.unavailable_reason()), reason=kernels.unavailable_reason() or "usable"),
 ]
 
 GPU = torch.device("cuda")

@@ -18,7 +18,6 @@ from helpers.raster_cases import (
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.distributed.shares import shares_of
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.cuda import training as training_kernels
 from turbogs_plugin.engine.protocol import MapUpdate
@@ -85,21 +84,6 @@ def test_equal_sets(unit, rate, hard, stable, uniform, importance, views):
         np.testing.assert_array_equal(known, asked)
     if importance:
         torch.testing.assert_close(found.weights.cpu(), expected.weights, rtol=2e-5, atol=0)
-
-
-@pytest.mark.parametrize("unit", ["pixel", "tile"])
-def test_several_processes_share_live_tiles_without_a_wait(unit):
-    maps, rule = masked_maps(DEVICE), DrawRule(unit, 0.4, 0.3, False, 0.0)
-    samples = training_kernels.sample_pixels(rule, maps, (3, NOTHING, 0), 0.3, Step(0, 9, 5))
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        shares = shares_of(samples, 2)
-        parts = [samples.of_tiles(share.tiles, share.views, share.slots) for share in shares if len(share)]
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert torch.equal(torch.cat([part.pixel_ids for part in parts]), samples.pixel_ids)
-    assert sorted({view for share in shares for view in range(3)[share.views]}) == [0, 1, 2]
 
 
 @pytest.mark.parametrize("unit", ["pixel", "tile"])

@@ -103,15 +103,6 @@ def test_iterations_that_do_nothing_leave_the_maps_alone(scene, monkeypatch):
     assert torch.equal(before["view_sums"], after["view_sums"])
 
 
-def test_training_with_everything_in_host_memory_learns(scene):
-    trainer = trained(scene, "host", "host", 0, *EVENTS)
-    first = trainer.maps.mean()
-    run(trainer, 40)
-    trainer.maps._means.restart()
-    assert trainer.maps.mean() < 0.8 * first
-    assert trainer.maps.window_bytes <= 4 * (10 * 333 * 215 + 1)
-
-
 def test_a_capture_larger_than_the_limit_trains_within_it():
     """200 photos of 3840x2160: 10 GB of maps and photos in 6 GiB, beside everything else."""
     scene = synthetic_scene(200, 3840, 2160, GPU)

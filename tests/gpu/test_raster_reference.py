@@ -12,11 +12,11 @@ from helpers.raster_cases import (
     upstream,
 )
 
-from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.reference.raster import kept, rasterize_reference
 from turbogs_plugin.engine.render_pass import RenderOptions
 from turbogs_plugin.engine.rules import NO_DROPOUT, Dropout
+from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
 from turbogs_plugin.types import GaussianStats
 
 pytestmark = GPU_ONLY

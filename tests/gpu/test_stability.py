@@ -7,18 +7,16 @@ import math
 import pytest
 import torch
 from helpers.framework_runs import assert_iterations_wait_for_nothing, tiny_capture, tiny_config
-from helpers.optimizers import make_gaussians as optimizer_gaussians
 from helpers.raster_cases import FORWARD_BOUND, GPU_ONLY, GRADIENT_BOUND
 from helpers.raster_extremes import CASES, NAMES, TWO_VIEWS, assert_within, compare, random_scene
 from helpers.tolerances import TOLERANCES
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.render import dense_samples, rasterize
-from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.train.run import train
 from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import GaussianStats, Step
+from turbogs_plugin.types import GaussianStats
 
 pytestmark = GPU_ONLY
 
@@ -60,18 +58,6 @@ def test_any_gaussian_among_ordinary_ones_stays_finite(size):
         assert all(value.isfinite().all() for value in (*vars(gradients).values(), *vars(stats).values())), case
         for name in NAMES[:-1]:
             assert (getattr(gradients, name)[:, ~gradients.touched] == 0).all(), f"{name}, {case}"
-
-
-def test_what_is_too_large_to_split_goes():
-    gaussians = optimizer_gaussians(200, dtype=torch.float32).map(lambda value: value.cuda())
-    gaussians.scales[::2] = 88.0
-    density = ErrorDrivenDensity(refine_from=200, top_fraction=1.0)
-    density.setup(gaussians)
-    for name in ("error_sums", "weight_sums", "grad_sums", "view_counts"):
-        getattr(density.stats, name).fill_(1.0)
-    step = Step(iteration=200, total=5000, refine_until=3500, seed=7, scene_extent=1.0)
-    result = density.update(gaussians, step).apply(gaussians)
-    assert all(value.isfinite().all() for _, value in result.items())
 
 
 @pytest.mark.parametrize("factor", [100, 1e4])

@@ -1,4 +1,4 @@
-"""The CUDA pixel sampler draws the sets of its torch twin."""
+"""The CUDA pixel sampler draws the sets of its torch twin; means of maps on a GPU never stall."""
 
 import numpy as np
 import pytest
@@ -131,3 +131,30 @@ def test_wrong_tensors_are_named(name):
     setattr(maps, name, value.float() if name == "errors" else value.repeat_interleave(2)[::2])
     with pytest.raises(RuntimeError, match=f"{name} must be a contiguous"):
         training_kernels.sample_pixels(DrawRule("pixel", 0.4, 0.3, False, 0.0), maps, (1,), 0.1, Step(0, 1, 1))
+
+
+def test_exponentials_have_the_same_bits():
+    words = torch.arange(1 << 23) << 9
+    assert torch.equal(exponentials(words), exponentials(words.cuda()).cpu())
+
+
+def test_means_are_a_known_number_of_calls_old():
+    """With refresh = 4: exact at the first call, then the state of 4 to 7 calls before, also across a resume."""
+    maps = ErrorMaps(np.array([[16, 16]]), device="cuda", refresh=4)
+    maps.initialise(0, torch.zeros(256, device="cuda"))
+    seen = []
+    for call in range(18):
+        maps.view_sums.fill_(256.0 * call)  # the mean at this call is its number
+        if call in (7, 10):
+            resumed = ErrorMaps(np.array([[16, 16]]), device="cuda", refresh=4)
+            resumed.load_state_dict(maps.state_dict())
+            maps = resumed
+        seen.append(maps.view_means()[0])
+    assert seen == [0, 0, 0, 0, 0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12]
+
+
+def test_sums_can_be_read_at_once_after_initialise():
+    maps = ErrorMaps(np.array([[16, 16]]), device="cuda", refresh=4)
+    for value in (1.0, 2.0, 3.0):
+        maps.initialise(0, torch.full((256,), value, device="cuda"))
+        assert maps.view_means()[0] == value

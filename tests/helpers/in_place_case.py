@@ -57,7 +57,7 @@ class Kept:
     def kept_rows(self, of_rows: Callable, screen: SharedScreen, rows: list, own: Any) -> Any:
         found, plain = of_rows(screen, rows, own), screen._plain
         if plain is not None:
-            plain = ScreenRecords(plain.records.clone(), plain.radii.clone(), plain.with_statistics)
+            plain = ScreenRecords(plain.records.clone(), plain.radii.clone())
         # The step leaves nothing of use in the records.
         self.screens.append((replace(screen, _plain=plain), rows, found.records.clone(), found.radii.clone()))
         return found
@@ -76,7 +76,7 @@ class Kept:
             setattr(owner, name, method)
         messages, engine = Messages(ranks), None  # which need no engine to collect
         for screen, rows, records, radii in self.screens:
-            target = ScreenRecords(torch.empty_like(records), torch.empty_like(radii), False)
+            target = ScreenRecords(torch.empty_like(records), torch.empty_like(radii))
             messages.collect(engine, screen.batch.shares, rows, screen._plain, target)
             assert torch.equal(radii, target.radii)
             seen = (radii > 0).any(dim=-1)

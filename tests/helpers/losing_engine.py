@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.reference.engine import ReferenceEngine
+from turbogs_plugin.engine import ReferenceEngine
 from turbogs_plugin.engine.reference.raster import rasterize_reference
 from turbogs_plugin.engine.render_pass import Rendered
 

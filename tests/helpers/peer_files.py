@@ -14,7 +14,7 @@ from torch import Tensor
 
 from turbogs_plugin.distributed.peer_memory import PeerMemory
 from turbogs_plugin.distributed.ranks import ProcessRanks
-from turbogs_plugin.engine.layout import ScreenRecord
+from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
 from turbogs_plugin.engine.render_pass import ScreenRecords
 from turbogs_plugin.engine.shared import PassMemory
 
@@ -79,7 +79,7 @@ class _Screen(_Forwarding):
         plain = self._wrapped.plain()
         if self._engine.lent is None:
             return plain
-        kept = ScreenRecords(*self._engine.views(*plain.records.shape[:2]), plain.with_statistics)
+        kept = ScreenRecords(*self._engine.views(*plain.records.shape[:2]))
         kept.records.copy_(plain.records)
         kept.radii.copy_(plain.radii)
         return kept
@@ -94,7 +94,7 @@ class KeepingEngine(LosingEngine):
 
     def lend(self, memory: PassMemory | None) -> bool:
         if memory is not self.lent:
-            flag = torch.zeros(1, dtype=torch.int32) if memory is None else memory.overflow
+            flag = torch.zeros(1, dtype=torch.int32) if memory is None else memory.status[PassStatus.OVERFLOW :][:1]
             self.flag = flag.copy_(self.flag)
         self.lent = memory
         return True

@@ -59,9 +59,7 @@ def test_a_tile_without_a_sample_is_as_if_it_were_not_listed(loss, tiles):
         result = loss(rendered.colors, truth, samples)
         for of_slots in (rendered.colors, rendered.alphas, result.color_gradients, result.pixel_errors):
             assert (of_slots[~filled] == 0).all()
-        plain = sparse_loss(
-            dataclasses.replace(loss.terms, structure="none", balance=False), rendered.colors, truth, samples
-        )
+        plain = sparse_loss(dataclasses.replace(loss.terms, structure="none"), rendered.colors, truth, samples)
         for structure in (result.loss - plain.loss, (result.color_gradients - plain.color_gradients)[filled]):
             structures[-1].append(structure / factor)
         maps.update(samples, result.pixel_errors, NOW)

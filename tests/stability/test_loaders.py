@@ -1,11 +1,12 @@
-"""Checkpoints, configurations, photos and transforms.json that were damaged or made to harm: a clear error or a correct
-result, in bounded memory. The loaders of COLMAP models and of .ply files are in scene/test_hostile.py."""
+"""Checkpoints, configurations, photos and masks that were damaged or made to harm: a clear error or a correct result.
+
+Memory is bounded. The loaders of COLMAP models and of .ply files are in captures/test_hostile.py.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import copy
-import json
 import random
 import shutil
 from pathlib import Path
@@ -15,18 +16,14 @@ import pytest
 import torch
 from helpers.bounded_memory import outcome_within
 from helpers.framework_runs import tiny_config
-from helpers.models import random_gaussians
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.gsplat_file import save_gsplat
-from turbogs_plugin.scene import Frame
 from turbogs_plugin.train import inputs, run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
-from turbogs_plugin.train.saved_model import load_given, load_model
-from turbogs_plugin.types import Gaussians
+from turbogs_plugin.train.saved_model import load_model
 
 MEMORY = 64 * 2**20
 """Python and numpy may allocate this much for files of less than a megabyte."""
@@ -92,7 +89,7 @@ def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
     shutil.copy(finished / "config.yaml", tmp_path / "run")
     choice, refused, cases = random.Random(3), 0, 0
     for path, _ in list(leaves(state)):
-        for _ in range(3):
+        for _ in range(2):
             changed = with_other_places(state)
             parent = changed
             for key in path[:-1]:
@@ -111,17 +108,7 @@ def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
                 run.resume(tmp_path / "run")
             except InputError:
                 refused += 1
-    assert cases > 80 and refused > 0.6 * cases
-
-
-def test_damaged_checkpoints(finished, tmp_path):
-    """Bytes of the archive changed: refused, or the very state that was saved (padding has no meaning)."""
-    content = latest_checkpoint(finished / "checkpoints").read_bytes()
-    choice, target, refused = random.Random(4), tmp_path / "iteration-000003.pt", 0
-    for _ in range(200):
-        target.write_bytes(damaged(content, choice))
-        refused += isinstance(outcome_within(MEMORY, load_checkpoint, target), InputError)
-    assert refused > 100
+    assert cases > 50 and refused > 0.6 * cases
 
 
 # ---- Text --------------------------------------------------------------------------------------------------------
@@ -129,15 +116,10 @@ def test_damaged_checkpoints(finished, tmp_path):
 
 BOMBS = {
     "aliases": "a: &a [x]\n" + "".join(f"b{i}: &b{i} [*a, *a]\n" for i in range(50)),
-    "merge keys": "a: &a {x: 1}\nb:\n  <<: *a\n",
     "tag": "a: !!python/object/apply:os.system ['true']",
-    "binary tag": "a: !!binary aGVsbG8=",
-    "tag directive": "%TAG ! tag:yaml.org,2002:python/\n---\na: !name:os.system x",
     "depth": "a: " + "{a: " * 5000 + "1" + "}" * 5000,
     "width": "a: [" + "1," * 100_000 + "1]",
     "interpolation": "a: ${oc.env:HOME}\nb: ${a}${a}",
-    "long number": "train: {seed: " + "9" * 10_000 + "}",
-    "many keys": "\n".join(f"k{i}: 1" for i in range(1000)),
     "control characters": "a: \x00\x07",
 }
 
@@ -151,32 +133,6 @@ def test_yaml_bombs(tmp_path, name):
 # ---- Captures ----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def transforms(capture, tmp_path) -> Path:
-    """A capture with a transforms.json and photos alone."""
-    scene = load_scene(capture)
-    folder = tmp_path / "transforms"
-    shutil.copytree(capture / "images", folder / "images")
-    frames = []
-    for name, viewmat in zip(scene.train.names, scene.train.cameras.viewmats, strict=True):
-        pose = torch.linalg.inv(viewmat.double()) @ torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
-        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
-    record = {"camera_angle_x": 0.8, "w": 48, "h": 40, "fl_x": 55.2, "fl_y": 55.2, "cx": 24, "cy": 20, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(record))
-    return folder
-
-
-def test_damaged_transforms(transforms):
-    content, choice, refused = (transforms / "transforms.json").read_bytes(), random.Random(6), 0
-    for _ in range(200):
-        (transforms / "transforms.json").write_bytes(damaged(content, choice))
-        result = outcome_within(MEMORY, load_scene, transforms)
-        refused += isinstance(result, InputError)
-        if not isinstance(result, InputError):
-            assert result.train.cameras.viewmats.isfinite().all() and result.points.isfinite().all()
-    assert refused > 50
-
-
 @pytest.mark.parametrize("kind", ["one byte", "cut", "other size", "text", "empty", "damaged"])
 def test_damaged_photos(capture, tmp_path, kind):
     folder = shutil.copytree(capture, tmp_path / "capture")
@@ -188,7 +144,7 @@ def test_damaged_photos(capture, tmp_path, kind):
         "other size": [b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x7f\xff\xff\xff\x7f\xff\xff\xff" + content[24:]],
         "text": [b"not a photo"],
         "empty": [b""],
-        "damaged": [damaged(content, choice) for _ in range(40)],
+        "damaged": [damaged(content, choice) for _ in range(20)],
     }[kind]
     refused = 0
     for changed in contents:
@@ -199,25 +155,19 @@ def test_damaged_photos(capture, tmp_path, kind):
             assert photo.name in str(result)
         else:
             assert np.isfinite(result.train.photos.colors.float().mean().item())
-    assert refused >= (1 if kind != "damaged" else 20)
+    assert refused >= (1 if kind != "damaged" else 10)
 
 
-@pytest.mark.parametrize("kind", ["masks", "transforms"])
-def test_damaged_masks(capture, transforms, tmp_path, kind):
-    """Of a folder, and of a transforms.json: named, or read as an image of the photo's size."""
-    folder = transforms if kind == "transforms" else shutil.copytree(capture, tmp_path / "capture")
-    photos, choice, refused = sorted((folder / "images").iterdir()), random.Random(8), 0
-    mask = np.random.default_rng(0).integers(0, 2, (40, 48)).astype(np.uint8) * 255
+def test_damaged_masks(capture, tmp_path):
+    """A mask is named, or read as an image of the photo's size."""
+    folder = shutil.copytree(capture, tmp_path / "capture")
+    name, choice, refused = f"{sorted((folder / 'images').iterdir())[2].stem}.png", random.Random(8), 0
     (folder / "masks").mkdir()
-    name = f"{photos[2].stem}.png" if kind == "masks" else "any.png"
-    if kind == "transforms":
-        content = json.loads((folder / "transforms.json").read_text())
-        content["frames"][1]["mask_path"] = "masks/any.png"
-        (folder / "transforms.json").write_text(json.dumps(content))
+    mask = np.random.default_rng(0).integers(0, 2, (40, 48)).astype(np.uint8) * 255
     Image.fromarray(mask).save(folder / "masks" / name)
     content = (folder / "masks" / name).read_bytes()
     bomb = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x7f\xff\xff\xff\x7f\xff\xff\xff" + content[24:]
-    for changed in [b"", b"\xff", bomb, *(damaged(content, choice) for _ in range(60))]:
+    for changed in [b"", b"\xff", bomb, *(damaged(content, choice) for _ in range(30))]:
         (folder / "masks" / name).write_bytes(changed)
         result = outcome_within(MEMORY, load_scene, folder)
         refused += isinstance(result, InputError)
@@ -225,32 +175,4 @@ def test_damaged_masks(capture, transforms, tmp_path, kind):
             assert name in str(result) and "\n" not in str(result)
         else:
             assert result.train.masks is None or (result.train.masks.pixel_counts > 0).all()
-    assert 20 < refused < 63
-
-
-# ---- Models trained anywhere -------------------------------------------------------------------------------------
-
-
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_damaged_models_of_gsplat(capture, tmp_path):
-    """Bytes of the file, and values in it: a model that is whole and finite, or a refusal."""
-    scene, target, choice = load_scene(capture), tmp_path / "model.pt", random.Random(6)
-    save_gsplat(random_gaussians(20, sh_degree=1), target, Frame(np.zeros(3), 1.0))
-    content, state = target.read_bytes(), torch.load(target, weights_only=True)
-    refused = 0
-    for case in range(120):
-        if case % 2:
-            target.write_bytes(damaged(content, choice))
-        else:
-            path, value = choice.choice(list(leaves(state)))
-            changed = copy.deepcopy(state)
-            parent = changed if len(path) == 1 else changed[path[0]]
-            parent[path[-1]] = hostile_leaf(value, choice)
-            torch.save(changed, target)
-        result = outcome_within(MEMORY, load_given, target, scene, torch.device("cpu"))
-        refused += isinstance(result, InputError)
-        if isinstance(result, Gaussians):
-            assert all(value.isfinite().all() and len(value) == len(result) for _, value in result.items())
-        else:
-            assert isinstance(result, InputError)
-    assert 60 < refused < 120
+    assert 10 < refused < 33

@@ -28,7 +28,6 @@ from turbogs_plugin.types import Gaussians
 
 MEMORY = 64 * 2**20
 """Python and numpy may allocate this much for files of less than a megabyte."""
-CPU = torch.device("cpu")
 NUMBERS = (float("nan"), float("inf"), 1e308, -1e308, 5e-324, 1e20, -1e3, 1e5, -1.0, 0.0, 0.3, 2**70, -(2**70))
 OTHERS = (None, "text", "../x", "", True, [], {}, [[1]], [1e400], {"k1": 1})
 
@@ -104,13 +103,13 @@ def test_other_values_in_files_of_frames(photos, kind):
     name, content = FILES[kind]
     content = {**content, "frames": frames("images", 5)}
     choice, refused = random.Random(kind), 0
-    for _ in range(150):
+    for _ in range(60):
         (photos / name).write_text(json.dumps(with_another(content, choice)))
         result = outcome_within(MEMORY, load_scene, photos)
         refused += isinstance(result, InputError)
         if not isinstance(result, InputError):
             require_whole(result)
-    assert 60 < refused < 150
+    assert 20 < refused < 60
 
 
 # ---- Models to start from ----------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ ANY_ERROR = st.sampled_from([0.0, 6e-8, 1e-3, 0.3, 3.0, 65504.0, 1e30, float("in
 LEVELS = st.sampled_from([0.0, 1e-20, 1e-4, 0.5, 1.0, 1e4, -1e4, 1e6])
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     sizes=st.lists(st.tuples(st.integers(1, 40), st.integers(1, 40)), min_size=1, max_size=4),
     palette=st.lists(ANY_ERROR, min_size=1, max_size=4),
@@ -58,7 +58,7 @@ def test_training_on_any_errors_keeps_maps_and_samples_valid(
             assert ((ages >= 0) & (ages <= AGE_MAX)).all()
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(
     counts=st.lists(st.integers(1, 40), min_size=1, max_size=4),
     level=LEVELS,

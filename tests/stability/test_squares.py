@@ -15,8 +15,6 @@ from turbogs_plugin.strategies.density.growth import TINY, drawn_by_squares
 from turbogs_plugin.types import GaussianStats, Step
 
 COUNT = 40
-SHARE = 2
-"""5 % of `COUNT`."""
 
 
 # ---- Few Gaussians, and caps ---------------------------------------------------------------------------------------
@@ -36,15 +34,6 @@ def test_a_model_of_less_than_20_loses_none_to_turnover(count, cap):
         assert len(update.source) == 1 and not update.fresh.any()  # the cut of a model that is above its cap
 
 
-@pytest.mark.parametrize("count", [20, 39, 40, 1000])
-def test_at_the_cap_what_goes_is_what_grows(count):
-    """A cap of exactly the present number: N stays, and 5 %, rounded down, change hands."""
-    update = event(small_model(count), window(spread_squares(count)), max_gaussians=count)
-    assert len(update.source) == count
-    assert len(removed(update, count)) == len(grown(update)) == math.floor(0.05 * count)
-    assert not removed(update, count) & grown(update)
-
-
 @pytest.mark.parametrize("fraction", [0.05, 0.5, 0.999])
 @pytest.mark.parametrize("count", [2, 3, 21, 60])
 def test_turnover_takes_its_share_and_never_all(count, fraction):
@@ -52,14 +41,6 @@ def test_turnover_takes_its_share_and_never_all(count, fraction):
     update = event(small_model(count), window(squares, passing=0.0), prune_score_fraction=fraction)
     least = set(squares.argsort()[: math.floor(fraction * count)].tolist())
     assert removed(update, count) == least and len(least) < count
-
-
-def test_what_an_event_makes_it_does_not_remove():
-    """The order is that of the window, which new rows were not in. None that goes has grown."""
-    squares = spread_squares(COUNT)
-    update = event(small_model(COUNT), window(squares), prune_score_fraction=0.5)
-    assert len(removed(update, COUNT)) == 20
-    assert grown(update) == set(range(COUNT)) - removed(update, COUNT)
 
 
 @pytest.mark.parametrize("step", [EVENT, Step(4000, 5000, 3500, scene_extent=2.0)], ids=["turnover", "final"])
@@ -87,16 +68,6 @@ def test_the_cut_to_a_cap_holds_where_squares_overflow(square, cap):
     assert kept == [2, 4, 5]  # the least, and the first of two average ones
 
 
-@pytest.mark.parametrize("score", ["raw", "balanced"])
-def test_the_cut_to_a_cap_holds_where_difficulties_overflow(score):
-    """By the paper's order: an error over a tiny weight is infinite, and as many go as have to."""
-    gaussians = small_model(6)
-    gaussians.opacities[0] = -20.0
-    stats = window([0.0] * 6)
-    stats.error_sums[1:], stats.weight_sums[1:] = 3e38, 1e-30
-    assert len(event(gaussians, stats, choose_by="difficulty", score=score, max_gaussians=1).source) == 1
-
-
 # ---- What a window may hold ----------------------------------------------------------------------------------------
 
 
@@ -116,13 +87,6 @@ def test_equal_squares_stand_together(value, room):
     update, again = (event(gaussians, stats, max_gaussians=cap) for _ in range(2))
     assert not removed(update, COUNT) and len(grown(update)) == (room or COUNT)
     assert torch.equal(update.source, again.source) and all_finite(update.apply(gaussians))
-
-
-def test_a_draw_among_equals_is_even():
-    stats = window([1e-14] * 8)
-    first = [int(drawn_by_squares(stats, event_at(100 * i)).argmax()) for i in range(1600)]
-    counts = torch.bincount(torch.tensor(first), minlength=8)
-    assert ((counts - 200).abs() < 5 * 13.3).all()  # 200 +- 5 standard deviations
 
 
 def test_squares_that_are_not_finite_are_drawn_last_and_never_go():
@@ -214,37 +178,6 @@ def test_the_unit_of_the_world_does_not_choose(scale):
     update = event(gaussians, stats, replace(EVENT, scene_extent=scale * EVENT.scene_extent), **settings)
     assert torch.equal(update.source, expected.source) and update.num_split == expected.num_split
     assert len(removed(update, COUNT)) > 4 and len(grown(update)) > 5
-
-
-@pytest.mark.parametrize(("factor", "passing"), [(1e-6, 0), (0.5, 0), (1.0, COUNT), (1e6, COUNT)])
-def test_the_gate_of_the_gradient_is_absolute(factor, passing):
-    """The draw has no unit, but how many grow has: below the threshold nobody does, and turnover goes on."""
-    stats = window(factor**2 * spread_squares(COUNT))
-    stats.absgrad_sums *= factor
-    update = event(small_model(COUNT), stats)
-    assert len(removed(update, COUNT)) == SHARE
-    assert len(grown(update)) == max(0, passing - SHARE)
-
-
-def test_without_growth_turnover_ends_at_19():
-    """33 events, as many as a run of the paper has, leave 18 to 19 % (0.95 ** 33)."""
-    gaussians = small_model(1000)
-    bounds = {33: (184, 210), 200: (19, 19)}
-    for number in range(1, 201):
-        update = event(gaussians, window(spread_squares(len(gaussians), number), passing=0.0), event_at(100 * number))
-        gaussians = gaussians if update is None else update.apply(gaussians)
-        if number in bounds:
-            least, most = bounds[number]
-            assert least <= len(gaussians) <= most
-
-
-@pytest.mark.parametrize("views", [1.0, 12800.0, 2.0**24])
-def test_a_window_of_many_views_keeps_its_means(views):
-    """Up to 2^24 views of a Gaussian, float32 counts exactly; the longest window of a run has some thousands."""
-    stats = window(spread_squares(COUNT), passing=0.5)
-    stats.absgrad_sums *= views
-    stats.view_counts.fill_(views)
-    assert len(grown(event(small_model(COUNT), stats, prune_score_fraction=0.0))) == COUNT // 2
 
 
 # ---- Many events ---------------------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ import torch
 from helpers.framework_runs import TINY
 from helpers.tolerances import PSNR_BOUND
 from PIL import Image
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import Config, load_config
@@ -99,9 +98,7 @@ def coordinates_run(capture: Path, out: Path) -> float:
 STEADY = ("train.iterations=15", "view_sampler.type=random", "pixel_sampler.type=random", "density.type=none")
 
 
-@pytest.mark.parametrize(
-    ("scale", "shift"), [(1e-4, 0), (1e4, 0), (1.0, 1e6), (1e4, 1e6), (1e-4, 1e6)], ids=lambda value: f"{value:g}"
-)
+@pytest.mark.parametrize(("scale", "shift"), [(1e4, 0), (1.0, 1e6), (1e-4, 1e6)], ids=lambda value: f"{value:g}")
 def test_coordinates_of_the_world_do_not_matter(variant, tmp_path, unmoved, scale, shift, record_property):
     move = pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.array([shift, -shift, shift], dtype=float))
     edit_model(variant, lambda reconstruction: reconstruction.transform(move))
@@ -127,14 +124,12 @@ PHOTOS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("name", "loss"),
-    [(name, "charbonnier_ncc") for name in PHOTOS] + [("one colour", "sparse_ssim"), ("exposures", "sparse_ssim")],
-)
-def test_photos_without_information(variant, tmp_path, name, loss, drawn):
+@pytest.mark.parametrize("name", ["black", "one colour", "exposures", "noise"])
+def test_photos_without_information(variant, tmp_path, name, drawn):
     edit_photos(variant, PHOTOS[name])
+    loss = "sparse_ssim" if name in ("one colour", "exposures") else "charbonnier_ncc"
     outcome = train_to_the_end(variant, tmp_path / "run", f"loss.type={loss}")
-    if name in ("black", "white", "one colour"):
+    if name in ("black", "one colour"):
         assert outcome.history[-1].psnr > outcome.history[0].psnr
 
 
@@ -147,12 +142,6 @@ def test_photos_with_exposures(variant, tmp_path, name):
     offsets = outcome.trainer.exposures.offsets
     assert offsets.isfinite().all() and offsets.abs().max() < 1.0
     assert offsets.mean(dim=0).abs().max() < 1e-5
-
-
-def test_one_photo_for_every_camera(variant, tmp_path):
-    first = np.asarray(Image.open(sorted((variant / "images").iterdir())[1]))
-    edit_photos(variant, lambda photo, number: first)
-    train_to_the_end(variant, tmp_path / "run")
 
 
 @pytest.mark.parametrize("copies", [2, 8])
@@ -215,19 +204,6 @@ def test_a_view_masked_whole(variant, tmp_path):
     trainer.require_finite()
 
 
-def test_points_that_no_camera_sees(variant, tmp_path):
-    """Nothing to see, nothing to learn: the run goes on to its end and changes nothing."""
-
-    def change(reconstruction: pycolmap.Reconstruction) -> None:
-        for point in reconstruction.points3D.values():
-            point.xyz = point.xyz + np.array([0.0, 0.0, 1000.0])
-
-    edit_model(variant, change)
-    outcome = train_to_the_end(variant, tmp_path / "run")
-    assert outcome.history[-1].psnr == outcome.history[0].psnr
-    assert outcome.history[-1].num_gaussians == outcome.history[0].num_gaussians
-
-
 # ---- Settings ----------------------------------------------------------------------------------------------------
 
 
@@ -265,62 +241,3 @@ def test_density_control_that_removes_everything(capture, tmp_path, overrides):
 def test_the_smallest_budget(capture, tmp_path):
     """One pixel a tile, one view."""
     train_to_the_end(capture, tmp_path / "run", "schedule.type=fixed", "schedule.views=1", "schedule.pixel_budget=1e-6")
-
-
-# ---- The guard ---------------------------------------------------------------------------------------------------
-
-
-class Reads(TorchDispatchMode):
-    """Counts operators that bring a value of the watched tensors to the host, which on a GPU would wait for it."""
-
-    def __init__(self, watched: Callable[[], list[torch.Tensor]]) -> None:
-        super().__init__()
-        self.watched = watched
-        self.count = 0
-
-    def __torch_dispatch__(self, operator, types, args=(), kwargs=None):
-        if "_local_scalar_dense" in str(operator) or "nonzero" in str(operator):
-            storages = {tensor.untyped_storage().data_ptr() for tensor in self.watched()}
-            self.count += args[0].untyped_storage().data_ptr() in storages
-        return operator(*args, **(kwargs or {}))
-
-
-def test_the_guard_reads_nothing_within_a_step(capture):
-    """Events are counted where the tensors are; only an evaluation reads the counts."""
-    config = small_config(capture)
-    trainer = Trainer(config.without_plan(), load_scene(capture), torch.device("cpu"))
-    trainer.initialise_maps()
-    losses = []
-    supervise = trainer.supervise
-
-    def remembered(*arguments):
-        losses.append(supervise(*arguments))
-        return losses[-1]
-
-    trainer.supervise = remembered
-    with Reads(lambda: [trainer.nonfinite_losses, trainer.optimizer.skipped, *(o.loss for o in losses)]) as reads:
-        for _ in range(5):
-            trainer.step()
-        assert reads.count == 0
-        assert int(trainer.nonfinite_losses) == int(trainer.optimizer.skipped) == 0
-    assert reads.count == 2
-    assert len(losses) == 5
-
-
-def test_events_are_shown_while_they_happen_and_in_the_report(capture, tmp_path, monkeypatch, capsys):
-    """Gradients of one Gaussian spoiled in four steps, losses in two."""
-    step = Trainer.step
-
-    def spoiled(trainer):
-        if 3 <= trainer.iteration < 5:
-            trainer.nonfinite_losses += 1
-        if 4 <= trainer.iteration < 8:
-            trainer.optimizer.moments.skipped += 1
-        step(trainer)
-
-    monkeypatch.setattr(Trainer, "step", spoiled)
-    outcome = run.train(small_config(capture), tmp_path / "run", write_report)
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("iteration")]
-    assert lines[-1].endswith("2 non-finite losses, 4 skipped updates") and "skipped" not in lines[0]
-    page = outcome.folder.report.read_text()
-    assert "non-finite loss: 2" in page and "not\nfinite: 4" in page

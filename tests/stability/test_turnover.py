@@ -1,8 +1,7 @@
-"""Trainings with growth drawn by squares and turnover: many events, moved worlds, a resume within a window."""
+"""Trainings with growth drawn by squares and turnover: many events, and moved worlds."""
 
 from __future__ import annotations
 
-import copy
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,7 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import TINY, assert_identical
+from helpers.framework_runs import TINY
 from helpers.squares import SQUARES
 from helpers.synthetic_capture import synthetic_scene
 from torch import Tensor
@@ -124,7 +123,7 @@ def test_without_a_cap_growth_is_bounded_by_the_gradient(photo, monkeypatch, rec
     assert 0 < max(shares) <= 1 and min(counts) >= 1
 
 
-# ---- Moved worlds, and a resume --------------------------------------------------------------------------------------
+# ---- Moved worlds --------------------------------------------------------------------------------------------------
 
 
 def small_config(capture: Path, *overrides: str) -> Config:
@@ -164,31 +163,3 @@ def test_in_a_moved_world_the_same_rows_are_drawn(capture, tmp_path, monkeypatch
     source, same_pruned = first_change(moved, monkeypatch)
     assert pruned == same_pruned > 0 and len(expected) == 110
     assert torch.equal(source, expected)
-
-
-def small_trainer(capture: Path) -> Trainer:
-    return Trainer(small_config(capture, "train.device=cpu").without_plan(), load_scene(capture), CPU)
-
-
-@pytest.fixture(scope="module")
-def states(capture) -> list[dict]:
-    """After so many iterations, up to 10."""
-    trainer = small_trainer(capture)
-    trainer.initialise_maps()
-    found = [copy.deepcopy(trainer.state_dict())]
-    for _ in range(10):
-        trainer.step()
-        found.append(copy.deepcopy(trainer.state_dict()))
-    return found
-
-
-@pytest.mark.parametrize("left_at", [5, 6, 8])
-def test_a_resume_within_a_window_gives_the_same_bits(capture, states, left_at):
-    """Its sums are in the state, and the draws are functions of seed and iteration."""
-    resumed, state = small_trainer(capture), states[left_at]
-    assert state["density"]["stats"]["square_sums"].max() > 0, "not within a window"
-    resumed.load_state_dict(copy.deepcopy(state))
-    for _ in range(10 - left_at):
-        resumed.step()
-    assert_identical(states[10], resumed.state_dict())
-    assert len(resumed.gaussians) != len(state["gaussians"]["means"]), "no event came after"

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from turbogs_plugin.engine.reference.losses import TileGroups, window_similarity
-from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.strategies.losses import EPSILON, CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.tiles import pixel_table
 from turbogs_plugin.types import PixelSamples
@@ -150,11 +149,6 @@ def test_value_and_gradient_are_the_equations(loss, weighted):
         numeric[place] = (up - down) / 2e-6
     assert result.color_gradients.numpy() == pytest.approx(numeric, rel=1e-4, abs=1e-8)
     assert np.abs(numeric).max() > 1e-3
-
-
-def test_ssim_has_no_balance():
-    with pytest.raises(ValueError, match="ssim has no balance"):
-        LossTerms(1e-3, structure="ssim", structure_weight=0.2, balance=True)
 
 
 @pytest.mark.parametrize("level", [1.0, 1e4, 1e6, 1e8])

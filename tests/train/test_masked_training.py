@@ -11,9 +11,9 @@ from helpers.framework_runs import assert_identical, tiny_capture, tiny_config
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.engine.autograd import rasterize_differentiable
 from turbogs_plugin.engine.render import rasterize, render_image
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
 from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.report.images import MASKED, strip
 from turbogs_plugin.report.run_report import write_report

@@ -311,7 +311,7 @@ def test_what_stands_before_a_camera_goes_with_the_next_change(capture, clears, 
     trainer.follow(RowUpdate(torch.arange(len(trainer.gaussians)), torch.zeros(len(trainer.gaussians)).bool(), {}))
     near = torch.cdist(trainer.gaussians.means, centers).amin(dim=1) < 0.01 * trainer.extent
     assert int(near.sum()) == remain
-    assert len(trainer.optimizer.moments) == len(trainer.density.stats.grad_sums) == len(trainer.gaussians)
+    assert len(trainer.optimizer.moments.steps) == len(trainer.density.stats.grad_sums) == len(trainer.gaussians)
 
 
 @pytest.mark.parametrize(

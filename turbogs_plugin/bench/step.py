@@ -193,7 +193,6 @@ def memory(trainer: Trainer, scene: Scene, peak: int, held: int) -> dict[str, in
         "density_statistics": tensor_bytes(trainer.density.state_dict()),
         "error_maps": tensor_bytes([trainer.maps.errors, trainer.maps.stamps]),
         "training_photos": tensor_bytes(trainer.views.photos.colors),
-        "raster_workspace": trainer.engine.bytes_held,
     }
     if trainer.device.type != "cuda":
         return stored | {"temporary": None, "peak": None}

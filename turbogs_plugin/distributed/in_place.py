@@ -153,7 +153,7 @@ class InPlace:
         assert self._passes is not None, "prepare says that there is no memory"
         memory, lent = self._passes
         if self._ranks.asked:
-            lent.stop.fill_(self._ranks.asked)
+            lent.status[PassStatus.STOP].fill_(self._ranks.asked)
         memory.barrier(WRITTEN)
         return engine.gather(memory.parts, self._starts[1], [share.num_slots for share in shares], seen)
 
@@ -187,11 +187,13 @@ class InPlace:
 
     def _screen(self, part: Tensor, views: int, gaussians: int) -> ScreenRecords:
         """A process's records [V, N, .], laid out from the start of what its engine was lent."""
-        radii, records = (
-            part[start : start + views * gaussians * size].view(views, gaussians, size)
-            for start, size in zip(self._starts[2:4], (RADII, RECORD), strict=True)
+        radii, records = (part.storage_offset() + start for start in self._starts[2:4])
+        shapes = [((views, gaussians, size), (gaussians * size, size, 1)) for size in (RECORD, RADII)]
+        # By as_strided, one operation: slicing takes the host as long as a launch does.
+        return ScreenRecords(
+            part.as_strided(*shapes[0], records),
+            part.as_strided(*shapes[1], radii).view(torch.int32),
         )
-        return ScreenRecords(records, radii.view(torch.int32), with_statistics=False)
 
 
 def _laid_out(like: Gaussians, part: Tensor, starts: Sequence[int]) -> Gaussians:

@@ -15,9 +15,8 @@ from turbogs_plugin.distributed.in_place import RADII
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.distributed.shares import Share
 from turbogs_plugin.engine.layout import PassStatus, ScreenRecord
-from turbogs_plugin.engine.reference.records import collect_records
 from turbogs_plugin.engine.render_pass import ScreenRecords
-from turbogs_plugin.engine.shared import SharedEngine
+from turbogs_plugin.engine.shared import SharedEngine, collect_records
 from turbogs_plugin.types import Gaussians
 
 ROW_STEP = 4
@@ -67,7 +66,7 @@ class Messages:
                 records, radii = message.split([ScreenRecord.SIZE * number, RADII * number])
                 records = records.view(len(share), count, ScreenRecord.SIZE)
                 radii = radii.view(torch.int32).view(len(share), count, RADII)
-                sources.append(ScreenRecords(records, radii, with_statistics=False))
+                sources.append(ScreenRecords(records, radii))
                 firsts.append(share.views.start)
         collect_records(sources, firsts, target, 0)
 

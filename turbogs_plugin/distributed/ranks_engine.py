@@ -83,8 +83,7 @@ class RanksEngine:
         self, engine: SharedEngine, ranks: ProcessRanks, device: torch.device, share: Sharing = share_memory
     ) -> None:
         self.engine, self.ranks, self.device = engine, ranks, device
-        self.draw, self.expose, self.learn_exposures = engine.draw, engine.expose, engine.learn_exposures
-        self.evaluate, self.learn = engine.evaluate, engine.learn
+        self.draw, self.evaluate, self.learn = engine.draw, engine.evaluate, engine.learn
         self.evaluate_and_learn, self.supervise = engine.evaluate_and_learn, engine.supervise
         self.in_place = True
         self.memory, self.messages = InPlace(ranks, share), Messages(ranks)
@@ -100,10 +99,6 @@ class RanksEngine:
     @property
     def overflow(self) -> Tensor | None:
         return self.engine.overflow
-
-    @property
-    def bytes_held(self) -> int:
-        return self.engine.bytes_held
 
     @property
     def way(self) -> str:
@@ -237,7 +232,7 @@ class SharedRendered(Rendered):
             errors = None if upstream.pixel_errors is None else upstream.pixel_errors[slots]
             own = self._rendered.backward(upstream.color_gradients[slots], errors, with_statistics=with_statistics)
             plain = own.plain()
-        return SharedScreen(self.batch, plain, with_statistics)
+        return SharedScreen(self.batch, plain)
 
 
 @dataclass
@@ -246,7 +241,6 @@ class SharedScreen:
 
     batch: Batch
     _plain: ScreenRecords | None
-    _with_statistics: bool
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
         """`ScreenGradients.parameter_gradients`, of all views and Gaussians, on every process."""
@@ -275,7 +269,7 @@ class SharedScreen:
         batch, shape = self.batch, (len(self.batch.samples.view_ids), len(own))
         records = torch.empty(*shape, ScreenRecord.SIZE, device=own.device)
         radii = torch.empty(*shape, 2, dtype=torch.int32, device=own.device)
-        target = ScreenRecords(records, radii, self._with_statistics)
+        target = ScreenRecords(records, radii)
         batch.exchange.collect(batch.engine, batch.shares, rows, self._plain, target)
         return batch.engine.screen_gradients(own, batch.cameras, batch.samples, batch.options, target)
 

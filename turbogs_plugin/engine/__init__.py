@@ -7,38 +7,30 @@ package chooses between the kernels and torch.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 
 from turbogs_plugin.engine.cuda import library
 from turbogs_plugin.engine.cuda.engine import CudaEngine
 from turbogs_plugin.engine.protocol import Engine
-from turbogs_plugin.engine.reference.engine import ReferenceEngine
+from turbogs_plugin.engine.reference.draws import draw_pixels
+from turbogs_plugin.engine.reference.losses import sparse_loss
+from turbogs_plugin.engine.reference.raster import rasterize_reference, screen_gradients
 from turbogs_plugin.engine.shared import SharedEngine
 
-__all__ = ["CompiledKernels", "Engine", "compiled_kernels", "engine_of"]
+__all__ = ["Engine", "ReferenceEngine", "engine_of", "library"]
 
 
-@dataclass(frozen=True)
-class CompiledKernels:
-    """The compiled library of kernels, for reports.
+class ReferenceEngine(SharedEngine):
+    """`Engine` in torch, the definition of every result, on any device and in float32 or float64.
 
-    Args:
-        path: where it is expected.
-        architectures: those it holds code for: ``sm_90``, ..., or PTX, ``compute_90``.
-        unavailable: why it cannot run here, in one line; "" if it can.
+    It keeps nothing between calls and never loses an iteration.
     """
 
-    path: Path
-    architectures: tuple[str, ...]
-    unavailable: str
-
-
-def compiled_kernels() -> CompiledKernels:
-    """The library that `engine_of` uses for CUDA tensors, or why it uses the reference instead."""
-    return CompiledKernels(library.library_path(), library.architectures(), library.unavailable_reason())
+    draw = staticmethod(draw_pixels)
+    render = staticmethod(rasterize_reference)
+    screen_gradients = staticmethod(screen_gradients)
+    evaluate = staticmethod(sparse_loss)
 
 
 def engine_of(device: torch.device, for_training: bool = False) -> SharedEngine:

@@ -38,7 +38,6 @@ WINDOW_RADIUS = 5
 UPDATE_KINDS = ("adam", "balanced_lm", "paper_lm")
 """Kinds of a step of the parameters. The kernels number them in this order."""
 
-
 MAX_PEERS = 8
 """Processes, of one host, that use each other's memory in place."""
 
@@ -148,9 +147,7 @@ def columns(row: type) -> dict[str, slice]:
 def interface(launches: list) -> str:
     """Order of the fields of `launches` (classes of `Launch`) and the numbers of this file, as text, which differs for
     a library from other sources."""
-    lines = []
-    for cls in launches:
-        lines.append(f"{cls.operator}: " + "; ".join(" ".join(names) for names in cls.paths))
+    lines = [f"{cls.operator}: " + "; ".join(" ".join(names) for names in cls.paths) for cls in launches]
     for name, value in globals().items():
         if isinstance(value, type):
             places = (f"{column} {place.start}:{place.stop}" for column, place in columns(value).items())

@@ -53,9 +53,6 @@ class GaussianMoments:
             torch.zeros((), dtype=torch.int64, device=gaussians.device),
         )
 
-    def __len__(self) -> int:
-        return self.steps.shape[0]
-
     def apply(self, update: RowUpdate) -> None:
         """Follow a change of the set of Gaussians."""
         for name in ("exp_avg", "exp_avg_sq", "exp_avg_shN", "exp_avg_sq_shN"):

@@ -1,7 +1,7 @@
 """The interface of an engine, which does all computation of a training on its device.
 
-A trainer needs no more than `Engine`. `engine.shared` has the defaults, `engine.reference` the definition of every
-result, `engine.cuda` its twin; `distributed.ranks_engine` is an engine of several GPUs around one of these.
+A trainer needs no more than `Engine`. `engine.reference` has the definition of every result, `engine.cuda` its twin,
+`engine.shared` what both offer to `distributed.ranks_engine`, an engine of several GPUs around one of these.
 """
 
 from __future__ import annotations
@@ -11,24 +11,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
+import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.types import (
-    Cameras,
-    Color,
-    Gaussians,
-    GaussianStats,
-    LossOutput,
-    PixelSamples,
-    RowUpdate,
-    Step,
-)
+from turbogs_plugin.scene.photos import PhotoSamples
+from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
 
 @dataclass(frozen=True)
@@ -46,35 +37,6 @@ class MapUpdate:
     nonfinite_losses: Tensor | None = None
 
 
-class StoredPhotos(Protocol):
-    """Photos as they are stored."""
-
-    @property
-    def colors(self) -> Tensor:
-        """[X, 3 or 4] uint8, the pixels of all training views, one view after the other."""
-
-
-class GroundTruth(Protocol):
-    """The photos at the samples of an iteration, which an engine may gather itself (`scene.photos.PhotoSamples`)."""
-
-    @property
-    def samples(self) -> PixelSamples: ...
-
-    @property
-    def photos(self) -> StoredPhotos: ...
-
-    @property
-    def background(self) -> Color:
-        """Colour that shows through photos with an alpha."""
-
-    @property
-    def starts(self) -> np.ndarray:
-        """[K] int64: the first row of `photos.colors` of each view of the batch."""
-
-    def colors(self) -> Tensor:
-        """[P, 3] float32, 0 .. 1: the colours at the samples, 0 in empty slots."""
-
-
 class Engine(Protocol):
     """Does all computation, on the device of the given tensors.
 
@@ -88,10 +50,7 @@ class Engine(Protocol):
     def overflow(self) -> Tensor | None:
         """[1] int32 on the device, never read on the host. While it is not 0, iterations are *skipped*: they change
         nothing, because a buffer was too small. None if that cannot happen."""
-
-    @property
-    def bytes_held(self) -> int:
-        """Bytes of memory kept from one iteration to the next."""
+        return None
 
     @abstractmethod
     def draw(self, rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
@@ -124,35 +83,26 @@ class Engine(Protocol):
         A sample with a non-finite rendered colour (of `colors` [P, 3]) or error counts as not sampled: the error and
         the stamp of its pixel stay. A skipped iteration (see `overflow`) changes nothing here.
         """
+        drawn, nonfinite = torch.isfinite(colors).all(dim=1), ~output.loss.isfinite()
+        if self.overflow is not None:
+            drawn, nonfinite = drawn & (self.overflow == 0), nonfinite & (self.overflow[0] == 0)
+        update.maps.update(samples, torch.where(drawn, output.pixel_errors, torch.nan), update.step)
+        if update.nonfinite_losses is not None:
+            update.nonfinite_losses.add_(nonfinite)
 
     def evaluate_and_learn(
         self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
     ) -> LossOutput:
         """`evaluate`, then `learn`."""
+        output = self.evaluate(terms, colors, targets, samples)
+        self.learn(samples, colors, output, update)
+        return output
 
-    def supervise(self, terms: LossTerms, colors: Tensor, truth: GroundTruth, update: MapUpdate) -> LossOutput:
+    def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         """`evaluate` against the photos at the samples, then `learn`. `colors`: [P, 3], on the engine's device."""
+        return self.evaluate_and_learn(terms, colors, truth.colors(), truth.samples, update)
 
-    def expose(self, exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
-        """[P, 3] float32: rendered colours [P, 3] as the exposure of each sample's photo shows them."""
-
-    def learn_exposures(
-        self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
-    ) -> Tensor:
-        """Take gradients back through `expose`, and make one step of Adam with the exposures of the batch.
-
-        A skipped iteration changes no exposure.
-
-        Args:
-            exposures: those that the colours were exposed with; changed in place.
-            colors: [P, 3], as given to `expose`.
-            gradients: [P, 3], d loss / d exposed colours; it cannot be used again.
-            rate: Adam's.
-
-        Returns:
-            [P, 3] float32, d loss / d colours.
-        """
-
+    @abstractmethod
     def update(
         self,
         rule: UpdateRule,
@@ -182,11 +132,13 @@ class Engine(Protocol):
         Raises:
             InputError: an iteration has more intersections of a tile and a splat than a pass can have.
         """
+        return 0
 
     # What follows is done at once on one device. An engine of several devices spreads work and state over them.
 
     def place(self, gaussians: Gaussians) -> Gaussians:
         """The model where the engine's steps change it: the given one, or a copy over the one placed before."""
+        return gaussians
 
     def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
         """Make every row of the moments and the statistics valid, before they are read: after `update` some may not be.
@@ -194,9 +146,11 @@ class Engine(Protocol):
         Args:
             moments: None where the statistics alone will be read, and more updates follow.
         """
+        return
 
     def agreed(self, update: RowUpdate | None) -> RowUpdate | None:
         """The change of the set of Gaussians that is made, where density control proposes this one."""
+        return update
 
     def verify(self, state: Callable[[], dict[str, Any]]) -> None:
         """Check a complete state before it is evaluated or saved.
@@ -207,3 +161,4 @@ class Engine(Protocol):
         Raises:
             TrainingStopped: devices hold different states.
         """
+        return

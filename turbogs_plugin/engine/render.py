@@ -10,21 +10,9 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine import engine_of
-from turbogs_plugin.engine.reference.raster import rasterize_reference
-from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings, Rendered, RenderOptions
+from turbogs_plugin.engine.render_pass import Rendered, RenderOptions
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
-
-__all__ = [
-    "DEFAULT_SETTINGS",
-    "RasterSettings",
-    "RenderOptions",
-    "RenderedImage",
-    "dense_samples",
-    "rasterize",
-    "rasterize_reference",
-    "render_image",
-]
 
 
 def rasterize(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:

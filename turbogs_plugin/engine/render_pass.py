@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import ClassVar, Protocol
 
+import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import MAX_SH_DEGREE
@@ -41,12 +42,10 @@ class ScreenRecords:
     Args:
         records: [K, N, 16], `layout.ScreenRecord`; where a Gaussian is not drawn, a record may hold anything.
         radii: [K, N, 2] int32 pixels, zero where off screen.
-        with_statistics: whether the columns that only density control asks for were filled.
     """
 
     records: Tensor
     radii: Tensor
-    with_statistics: bool
 
 
 class ScreenGradients(Protocol):
@@ -66,15 +65,11 @@ class ScreenGradients(Protocol):
 
     def full_records(self) -> Tensor:
         """[K, N, 16] the gradients on the screen, `layout.ScreenRecord`; zero where a Gaussian is not drawn."""
+        plain = self.plain()
+        return torch.where((plain.radii > 0).any(dim=-1, keepdim=True), plain.records, 0.0)
 
     def plain(self) -> ScreenRecords:
         """Plain tensors; the inverse of `Engine.screen_gradients`."""
-
-
-def require_statistics(with_statistics: bool, stats: GaussianStats | None) -> None:
-    """Raise `ValueError` if statistics are wanted from a backward pass that did not sum them up."""
-    if stats is not None and not with_statistics:
-        raise ValueError("statistics of a pass without them: call Rendered.backward(..., with_statistics=True)")
 
 
 @dataclass(frozen=True)
@@ -128,7 +123,7 @@ class Rendered(ABC):
             alpha_gradients, depth_gradients: [P], where the loss has such terms.
 
         Raises:
-            InputError: on CUDA, depth gradients for a pass without depths, or a tensor of wrong shape, dtype or device.
+            RuntimeError: on CUDA, depth gradients for a pass without depths, or a tensor of wrong shape or dtype.
         """
         return self._backward(
             Upstream(color_gradients, alpha_gradients, depth_gradients, pixel_errors), with_statistics
@@ -140,11 +135,8 @@ class Rendered(ABC):
 
 
 EXTENT_MAX = 3.33
-"""gsplat's limit of a splat's half-width, in standard deviations. At the default `alpha_min` it cuts nothing visible:
-an opaque splat fades to 1/255 at 3.329."""
-
-ALPHA_MIN_LOWEST = math.exp(-(EXTENT_MAX**2) / 2)
-"""Share of its opacity that a splat has left at `EXTENT_MAX` standard deviations: exp(-3.33^2 / 2)."""
+"""gsplat's limit of a splat's half-width, in standard deviations. It cuts nothing visible: an opaque splat fades to
+1/255, `RasterSettings.alpha_min`, at 3.329."""
 
 
 @dataclass(frozen=True)
@@ -153,13 +145,13 @@ class RasterSettings:
 
     Args:
         eps2d: blur, added to the diagonal of the projected covariance, pixels squared; 0 or more.
-        near_plane, far_plane: depths outside are not drawn, world units; 0 < near_plane < far_plane.
-        alpha_min: a splat with less opacity at a pixel is skipped there. At least exp(-3.33^2 / 2), about 0.00391.
-            Below that the engines would differ: the reference cuts splats at 3.33 standard deviations, the CUDA kernels
-            where they reach alpha_min.
-        alpha_max: opacity at a pixel is limited to this (without a gradient beyond); between alpha_min and 1.
+        near_plane, far_plane: depths outside are not drawn, world units; near_plane above 0.
         transmittance_min: transmittance of a pixel that ends it, before the splat that would bring it to this or below;
             between 0 and 1. The only one that a configuration sets.
+
+    Attributes:
+        alpha_min: a splat with less opacity at a pixel is skipped there.
+        alpha_max: opacity at a pixel is limited to this, without a gradient beyond.
 
     Raises:
         InputError: a value outside these bounds.
@@ -168,19 +160,13 @@ class RasterSettings:
     eps2d: float = field(default=0.3, metadata={"setting": False})
     near_plane: float = field(default=0.01, metadata={"setting": False})
     far_plane: float = field(default=1e10, metadata={"setting": False})
-    alpha_min: float = field(default=1.0 / 255.0, metadata={"setting": False})
-    alpha_max: float = field(default=0.999, metadata={"setting": False})
     transmittance_min: float = 1e-4
+    alpha_min: ClassVar[float] = 1.0 / 255.0
+    alpha_max: ClassVar[float] = 0.999
 
     def __post_init__(self) -> None:
         require(0 <= self.eps2d < math.inf, "eps2d", self.eps2d, "finite and at least 0")
         require(self.near_plane > 0, "near_plane", self.near_plane, "above 0")
-        beyond = f"above near_plane = {self.near_plane!r}"
-        require(self.far_plane > self.near_plane, "far_plane", self.far_plane, beyond)
-        lowest = f"at least exp(-3.33^2 / 2) = {ALPHA_MIN_LOWEST:.7f} and below 1"
-        require(ALPHA_MIN_LOWEST <= self.alpha_min < 1, "alpha_min", self.alpha_min, lowest)
-        between = f"above alpha_min = {self.alpha_min!r} and below 1"
-        require(self.alpha_min < self.alpha_max < 1, "alpha_max", self.alpha_max, between)
         require(0 < self.transmittance_min < 1, "transmittance_min", self.transmittance_min, "between 0 and 1")
 
 

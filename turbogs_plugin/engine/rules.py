@@ -104,10 +104,6 @@ class LossTerms:
         structure: one of `layout.STRUCTURES`.
         structure_weight: factor of the mean over tiles and channels of 1 - S, S the similarity.
         variance_constant: c of `ncc`, epsilon of `printed_ncc`.
-        balance: scale the structure term by the paper's lambda, the gradient-balanced weight. Not with `ssim`.
-
-    Raises:
-        ValueError: `balance` with `ssim`, which has many windows in a tile.
     """
 
     epsilon: float
@@ -115,11 +111,11 @@ class LossTerms:
     structure: str = "none"
     structure_weight: float = 0.0
     variance_constant: float = STRUCTURE_CONSTANT
-    balance: bool = False
 
-    def __post_init__(self) -> None:
-        if self.structure == "ssim" and self.balance:
-            raise ValueError("the structure ssim has no balance: use ncc")
+    @property
+    def balance(self) -> bool:
+        """Whether the structure term is scaled by the paper's lambda: but for `ssim`, which has many windows a tile."""
+        return self.structure in ("ncc", "printed_ncc")
 
 
 @dataclass(frozen=True)

@@ -7,25 +7,21 @@ and its step may change their copies of the model too (`ModelCopies`).
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.layout import PassStatus
 from turbogs_plugin.engine.moments import GaussianMoments
-from turbogs_plugin.engine.protocol import Engine, GroundTruth, MapUpdate
-from turbogs_plugin.engine.reference.exposed_colors import expose, exposure_gradients, step_exposures
-from turbogs_plugin.engine.reference.records import collect_records, gather_colors
+from turbogs_plugin.engine.protocol import Engine
 from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients, ScreenRecords
-from turbogs_plugin.engine.rules import LossTerms, UpdateRule
+from turbogs_plugin.engine.rules import UpdateRule
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate
+from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, PixelSamples
 
 
 @dataclass
@@ -41,16 +37,6 @@ class PassMemory:
     colors: Tensor
     radii: Tensor
     records: Tensor
-
-    @cached_property
-    def overflow(self) -> Tensor:
-        """[1] int32 of `status`."""
-        return self.status[PassStatus.OVERFLOW :][:1]
-
-    @cached_property
-    def stop(self) -> Tensor:
-        """[1] int32 of `status`."""
-        return self.status[PassStatus.STOP :][:1]
 
 
 @dataclass
@@ -79,45 +65,29 @@ class ModelCopies:
         return tuple(distance for each in found for distance in each)
 
 
+def collect_records(sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
+    """Collect the records of all K views for some rows. What several processes have of one view is added up, in
+    their order.
+
+    Args:
+        sources: of each process with views, in their order: of V views and N Gaussians; maybe other devices'
+            memory, read in place.
+        views: first view of each, in the batch: the last one of the process before, or the next.
+        target: of K views and M Gaussians; overwritten, but where off screen an engine may leave what is there.
+        row: first of the M among the N.
+    """
+    rows, end = slice(row, row + target.records.shape[1]), 0
+    for source, view in zip(sources, views, strict=True):
+        if view < end:  # shared with the process before
+            target.records[view] += source.records[0, rows]
+        new, fresh = slice(end - view, None), slice(end, view + len(source.records))
+        target.records[fresh], target.radii[fresh] = source.records[new, rows], source.radii[new, rows]
+        end = fresh.stop
+
+
 class SharedEngine(Engine):
     """An engine on one device, without what each engine does in its own way: draw, render, evaluate, go back from the
     screen (`screen_gradients`), and recover. Passes and steps can be put together with other engines' of its kind."""
-
-    @property
-    def overflow(self) -> Tensor | None:
-        return None
-
-    @property
-    def bytes_held(self) -> int:
-        return 0
-
-    def supervise(self, terms: LossTerms, colors: Tensor, truth: GroundTruth, update: MapUpdate) -> LossOutput:
-        return self.evaluate_and_learn(terms, colors, truth.colors(), truth.samples, update)
-
-    def evaluate_and_learn(
-        self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
-    ) -> LossOutput:
-        output = self.evaluate(terms, colors, targets, samples)
-        self.learn(samples, colors, output, update)
-        return output
-
-    def learn(self, samples: PixelSamples, colors: Tensor, output: LossOutput, update: MapUpdate) -> None:
-        drawn, nonfinite = torch.isfinite(colors).all(dim=1), ~output.loss.isfinite()
-        if self.overflow is not None:
-            drawn, nonfinite = drawn & (self.overflow == 0), nonfinite & (self.overflow[0] == 0)
-        update.maps.update(samples, torch.where(drawn, output.pixel_errors, torch.nan), update.step)
-        if update.nonfinite_losses is not None:
-            update.nonfinite_losses.add_(nonfinite)
-
-    def expose(self, exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
-        return expose(exposures, colors, samples)
-
-    def learn_exposures(
-        self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
-    ) -> Tensor:
-        of_colors, sums = exposure_gradients(exposures, colors, gradients, samples)
-        step_exposures(exposures, sums, samples.view_ids, rate, self.overflow)
-        return of_colors
 
     def update(
         self,
@@ -134,33 +104,7 @@ class SharedEngine(Engine):
             for name, value in copy.items():
                 value.copy_(getattr(gaussians, name))
 
-    def settle(self, wait: bool = False) -> int:
-        return 0
-
-    def place(self, gaussians: Gaussians) -> Gaussians:
-        return gaussians
-
-    def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
-        """Every row is always valid here."""
-
-    def agreed(self, update: RowUpdate | None) -> RowUpdate | None:
-        return update
-
-    def verify(self, state: Callable[[], dict[str, Any]]) -> None:
-        """There is one state."""
-
-    def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
-        """Collect the records of all K views for some rows. What several processes have of one view is added up, in
-        their order.
-
-        Args:
-            sources: of each process with views, in their order: of V views and N Gaussians; maybe other devices'
-                memory, read in place.
-            views: first view of each, in the batch: the last one of the process before, or the next.
-            target: of K views and M Gaussians; overwritten, but for records that are off screen.
-            row: first of the M among the N.
-        """
-        collect_records(sources, views, target, row)
+    collect = staticmethod(collect_records)
 
     def lend(self, memory: PassMemory | None) -> bool:
         """Let the following passes keep in this memory what it is for, as far as it fits in. None: in the engine's own.
@@ -183,10 +127,12 @@ class SharedEngine(Engine):
         Returns:
             [P, 3] float32, one process's after the other's; valid until the next call.
         """
-        colors = gather_colors(parts, first, counts, seen)
+        statuses = torch.stack([part[: PassStatus.SIZE].view(torch.int32) for part in parts])  # [processes, 3]
+        seen.copy_(statuses[:, PassStatus.OVERFLOW :].amax(dim=0))
         if self.overflow is not None:
             self.overflow.copy_(seen[:1])
-        return colors
+        pieces = [part[first : first + 3 * count] for part, count in zip(parts, counts, strict=True)]
+        return torch.cat(pieces).view(-1, 3)
 
     @abstractmethod
     def screen_gradients(
@@ -205,7 +151,7 @@ class SharedEngine(Engine):
             plain: of these views and Gaussians.
         """
 
-    @abstractmethod
     def recover(self) -> None:
         """Prepare to repeat iterations that were skipped because another process's memory was too small: waits for the
-        device, takes in what it learned of the memory needed, and clears `overflow`."""
+        device, takes in what it learned of the memory needed, and clears `overflow`. Nothing here, where nothing is
+        kept."""

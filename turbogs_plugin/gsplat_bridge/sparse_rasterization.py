@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from turbogs_plugin.engine import engine_of
-from turbogs_plugin.engine.autograd import DifferentiableRender, rasterize_differentiable
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.gsplat_bridge.autograd import DifferentiableRender, rasterize_differentiable
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
 from turbogs_plugin.gsplat_bridge.host import (
     GROUND_TRUTH,

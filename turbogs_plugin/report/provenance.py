@@ -17,7 +17,7 @@ import torch
 
 from turbogs_plugin import __version__
 from turbogs_plugin.device import processor_cores
-from turbogs_plugin.engine import compiled_kernels
+from turbogs_plugin.engine import library
 
 PACKAGES = ("torch", "gsplat", "numpy", "pycolmap")
 """Packages whose versions change results."""
@@ -50,9 +50,8 @@ class Provenance:
 
 def provenance(device_type: str) -> Provenance:
     """The provenance of results of this process, computed on `cpu` or `cuda`."""
-    kernels = compiled_kernels()
-    reason = kernels.unavailable if device_type == "cuda" else "the device is the CPU"
-    engine = f"{kernels.path.name} for {', '.join(kernels.architectures)}"
+    reason = library.unavailable_reason() if device_type == "cuda" else "the device is the CPU"
+    engine = f"{library.library_path().name} for {', '.join(library.architectures())}"
     if reason:
         engine = f"none, the torch reference ran: {reason}"
     day = datetime.now(timezone.utc).date().isoformat()

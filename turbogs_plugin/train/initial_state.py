@@ -24,8 +24,10 @@ def first_exposures(scene: Scene, resuming: bool, device: torch.device) -> Expos
     views = scene.train
     if resuming:
         return Exposures.identity(len(views), device)
-    gains = compare_exposures(views, scene.points).gains  # [V, 3]
-    return Exposures.of_gains(torch.from_numpy(gains), device)
+    gains = compare_exposures(views, scene.points).gains  # [V, 3] of the channels, in stops
+    exposures, factors = Exposures.identity(len(gains), device), 2.0 ** torch.from_numpy(gains).double()  # [V, 3]
+    exposures.offsets[:, range(3), range(3)] = (factors / factors.mean(dim=0) - 1.0).to(exposures.offsets)
+    return exposures
 
 
 def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:

@@ -13,7 +13,7 @@ from turbogs_plugin.captures.camera_refinement import load_and_find, with_camera
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.ranks import ONE, Ranks
-from turbogs_plugin.engine import compiled_kernels
+from turbogs_plugin.engine import library
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.agreement import require_agreement
@@ -88,7 +88,7 @@ def open_started(
         ranks.meet(device)
         synchronize(device)  # makes CUDA's context, and takes no memory through torch
         if device.type == "cuda":
-            compiled_kernels()
+            library.unavailable_reason()  # loads it
         return device
 
     with ThreadPoolExecutor(1) as pool:

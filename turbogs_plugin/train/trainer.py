@@ -15,14 +15,15 @@ from torch import Tensor
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine, engine_of
-from turbogs_plugin.engine.exposures import exposure_rate
-from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
+from turbogs_plugin.engine.exposures import exposure_gradients, exposure_rate, step_exposures
+from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import Dropout
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.limits import RESTRAIN_EVERY, Clearance, restrain_distant
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.train.training_state import TrainingState
 from turbogs_plugin.types import GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
@@ -120,7 +121,7 @@ class Trainer(TrainingState):
         if self.parameter_mean is not None and self.parameter_mean.due(self.iteration, self.iterations):
             self.parameter_mean.add(self.learnt())
 
-    def supervise(self, colors: Tensor, truth: GroundTruth, step: Step) -> LossOutput:
+    def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
         """Loss and error maps, and the exposures of the photos where they are learnt.
 
         Loss and maps are one step if the loss is a rule, else the loss's own code comes first.
@@ -135,8 +136,8 @@ class Trainer(TrainingState):
             self.engine.learn(samples, shown, loss, update)
         if self.exposures is None:
             return loss
-        rate, gradients = exposure_rate(step), loss.color_gradients
-        gradients = self.engine.learn_exposures(self.exposures, colors, gradients, samples=samples, rate=rate)
+        gradients, sums = exposure_gradients(self.exposures, colors, loss.color_gradients, samples)
+        step_exposures(self.exposures, sums, samples.view_ids, exposure_rate(step), self.engine.overflow)
         return replace(loss, color_gradients=gradients)
 
     def update(self, screen: ScreenGradients, stats: GaussianStats | None, step: Step) -> None:

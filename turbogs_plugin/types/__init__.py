@@ -19,7 +19,7 @@ from turbogs_plugin.types.gaussians import (
     GaussianStats,
     RowUpdate,
 )
-from turbogs_plugin.types.samples import TILE_SIZE, LossOutput, PixelSamples, TileGrid, sample_order
+from turbogs_plugin.types.samples import TILE_SIZE, LossOutput, PixelSamples, TileGrid, on_device, sample_order
 from turbogs_plugin.types.step import SamplingBudget, Step
 
 __all__ = [
@@ -39,5 +39,6 @@ __all__ = [
     "SamplingBudget",
     "Step",
     "TileGrid",
+    "on_device",
     "sample_order",
 ]

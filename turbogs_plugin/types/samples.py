@@ -39,6 +39,12 @@ def _starts(sizes: bytes, origin: tuple[int, int]) -> tuple[int, ...]:
     return 0, *grid.shapes.prod(axis=1).cumsum().tolist()
 
 
+def on_device(numbers: Sequence[int] | np.ndarray, device: torch.device) -> Tensor:
+    """Numbers of the host as a tensor on a device, sent to a GPU without waiting for it."""
+    tensor = torch.as_tensor(numbers)
+    return tensor if device.type == "cpu" else tensor.pin_memory().to(device, non_blocking=True)
+
+
 @dataclass
 class TileGrid:
     """The tiles of a batch of K images, numbered without gaps: view after view, row after row.
@@ -189,7 +195,7 @@ class PixelSamples:
 
     def view_of_tile(self) -> Tensor:
         """[T] int64: position in the batch (0 .. K-1) of the view of each tile of `tile_ids`."""
-        ends = torch.as_tensor(self.grid.offsets[1:], device=self.tile_ids.device)
+        ends = on_device(self.grid.offsets[1:], self.tile_ids.device)
         return torch.searchsorted(ends, self.tile_ids.long(), right=True)
 
     def view_of_slot(self) -> Tensor:

@@ -13,15 +13,16 @@ from turbogs_plugin.engine.cuda.raster import (
     CudaRendered,
     CudaScreenGradients,
     rasterize_cuda,
-    screen_gradients,
+    ready,
+    scene_of,
 )
 from turbogs_plugin.engine.cuda.workspace import Workspace
-from turbogs_plugin.engine.exposures import Exposures
-from turbogs_plugin.engine.protocol import GroundTruth, MapUpdate
+from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, RenderOptions, ScreenRecords
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.engine.shared import PassMemory, SharedEngine
-from turbogs_plugin.types import BLACK, Cameras, Gaussians, LossOutput, PixelSamples
+from turbogs_plugin.scene.photos import PhotoSamples
+from turbogs_plugin.types import Cameras, Gaussians, LossOutput, PixelSamples
 
 
 class CudaEngine(SharedEngine):
@@ -42,7 +43,6 @@ class CudaEngine(SharedEngine):
     draw = staticmethod(training.sample_pixels)
     evaluate = staticmethod(training.sparse_loss)
     update = staticmethod(training.fused_step)
-    expose = staticmethod(training.expose_colors)
 
     def render(
         self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions = DEFAULT_OPTIONS
@@ -57,7 +57,8 @@ class CudaEngine(SharedEngine):
         options: RenderOptions,
         plain: ScreenRecords,
     ) -> CudaScreenGradients:
-        return screen_gradients(gaussians, cameras, samples, options, plain, self.workspace)
+        scene = scene_of(ready(gaussians), cameras, options)
+        return CudaScreenGradients(scene, samples, plain.records, plain.radii, self.overflow)
 
     def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
         arrays = [array for source in sources for array in (source.records, source.radii)]
@@ -69,16 +70,11 @@ class CudaEngine(SharedEngine):
         return self.workspace is not None
 
     def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
-        def arguments(buffers: Buffers, *_: int) -> launches.GatherColors:
-            colors = buffers.floats("gathered_colors", sum(counts), 3)
-            return launches.GatherColors(colors, list(counts), first, seen, self.overflow, list(parts))
+        colors = Buffers(self.workspace, seen.device).floats("gathered_colors", sum(counts), 3)
+        library.launch(launches.GatherColors(colors, list(counts), first, seen, self.overflow, list(parts)))
+        return colors
 
-        places = [part.data_ptr() for part in (*parts, seen)]
-        launch = Buffers(self.workspace, seen.device).kept("gather", arguments, first, *counts, *places)
-        library.launch(launch)
-        return launch.colors
-
-    def supervise(self, terms: LossTerms, colors: Tensor, truth: GroundTruth, update: MapUpdate) -> LossOutput:
+    def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel.
         # If only one of the two is in host memory, they do not.
         photos, starts = truth.photos.colors, update.maps.offsets[list(truth.samples.view_ids)]
@@ -90,13 +86,7 @@ class CudaEngine(SharedEngine):
     def evaluate_and_learn(
         self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
     ) -> LossOutput:
-        shared = self.overflow, BLACK, self.workspace
-        return training.sparse_loss(terms, colors, targets, samples, update, *shared)
-
-    def learn_exposures(
-        self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
-    ) -> Tensor:
-        return training.learn_exposures(exposures, colors, gradients, samples, rate, self.overflow)
+        return training.sparse_loss(terms, colors, targets, samples, update, self.overflow, workspace=self.workspace)
 
     def settle(self, wait: bool = False) -> int:
         return 0 if self.workspace is None else self.workspace.take_lost(wait)
@@ -105,7 +95,3 @@ class CudaEngine(SharedEngine):
         if self.workspace is not None:
             self.workspace.take_lost(wait=True)
             self.workspace.status.zero_()
-
-    @property
-    def bytes_held(self) -> int:
-        return 0 if self.workspace is None else self.workspace.bytes_held()

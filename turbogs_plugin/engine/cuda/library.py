@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import torch
 
 from turbogs_plugin.engine import layout
 from turbogs_plugin.engine.cuda import launches
-from turbogs_plugin.errors import InputError
 
 LIBRARY_VARIABLE = "TURBOGS_LIBRARY"
 """Environment variable with the path of another build of the library, to compare builds."""
-
-FIRST_TORCH = (2, 10)
-"""The library uses the stable interface of this version of torch."""
-
-
-OLDEST_CAPABILITY = (8, 0)
-"""GPUs before this lack an instruction that the kernels use."""
 
 
 def library_path() -> Path:
@@ -37,45 +28,28 @@ def _load_failure() -> str:
     path = library_path()
     if not path.is_file():
         return f"{path.name} is not built (TURBOGS_CUDA=require pip install --no-build-isolation . says why)"
-    version = tuple(int(part) for part in re.findall(r"\d+", torch.__version__)[:2])
-    if version < FIRST_TORCH:
-        return f"the library needs torch >= {'.'.join(map(str, FIRST_TORCH))}, this is {torch.__version__}"
     try:
         torch.ops.load_library(str(path))
     except OSError as error:
         return f"{path.name} does not load: {str(error).splitlines()[0]}"
-    if _interface() != layout.interface(launches.LAUNCHES):
+    interface = getattr(torch.ops.turbogs, "interface", str)  # older libraries have none
+    if interface() != layout.interface(launches.LAUNCHES):
         return f"{path.name} was built from other sources than this package: build it again"
     return ""
 
 
-def _interface() -> str:
-    """The order of fields and the sizes that the loaded library was built with, as text."""
-    tell = getattr(torch.ops.turbogs, "interface", None)  # older libraries have none
-    return "" if tell is None else tell()
-
-
-def _runs_on(architecture: str, capability: tuple[int, int]) -> bool:
-    """Whether code of this name (``sm_90``, ``sm_90a``, PTX: ``compute_90``) runs on a GPU of this capability."""
-    match = re.fullmatch(r"(sm|compute)_(\d+)(\d)([af]?)", architecture)
-    if match is None:
-        return False
-    kind, major, minor, kin = match.groups()
-    built = int(major), int(minor)
-    if kin == "a":  # only for that GPU
-        return built == capability
-    if kind == "compute" and not kin:
-        return built <= capability
-    return built[0] == capability[0] and built[1] <= capability[1]
-
-
 def _mismatch(architectures: tuple[str, ...], capability: tuple[int, int]) -> str:
-    """Why a library of these architectures has no code for such a GPU, in one line; "" if it has."""
-    if any(_runs_on(architecture, capability) for architecture in architectures):
-        return ""
+    """Why a library of these architectures has no code for a GPU of this capability, in one line; "" if it has.
+
+    Machine code (``sm_90``) runs on its capability and later ones of its generation, PTX (``compute_90``) on all later.
+    Code with a letter (``sm_90a``) counts for its capability alone.
+    """
+    for kind, number in (architecture.split("_") for architecture in architectures):
+        built = divmod(int(number.rstrip("af")), 10)
+        later = number.isdigit() and built <= capability and (kind == "compute" or built[0] == capability[0])
+        if later or built == capability:
+            return ""
     present = "{}{}".format(*capability)
-    if capability < OLDEST_CAPABILITY:
-        return f"this GPU is sm_{present}: the kernels need compute capability 8.0 or newer"
     return f"built for {', '.join(architectures)}, this GPU is sm_{present}: rebuild with TURBOGS_CUDA_ARCH={present}"
 
 
@@ -86,35 +60,14 @@ def unavailable_reason() -> str:
         return failure
     if not torch.cuda.is_available():
         return "torch sees no CUDA device"
+    for cls in launches.LAUNCHES:
+        setattr(operators, cls.operator, getattr(torch.ops.turbogs, cls.operator).default)  # the only overload
     return _mismatch(architectures(), torch.cuda.get_device_capability())
 
 
-def available() -> bool:
-    """The library is loaded, torch sees a CUDA device, and the library has code for it."""
-    return not unavailable_reason()
-
-
-def require() -> None:
-    """Load the library.
-
-    Raises:
-        InputError: the kernels cannot run here.
-    """
-    if reason := unavailable_reason():
-        raise InputError(f"CUDA kernels: {reason}")
-
-
-class _Operators:
-    """The library's operators as attributes, each kept: to look one up for each launch takes a third of the call."""
-
-    def __getattr__(self, name: str) -> Callable[..., None]:
-        operator = getattr(torch.ops.turbogs, name).default  # the only overload
-        setattr(self, name, operator)
-        return operator
-
-
-operators = _Operators()
-"""What `launch` calls. A recorder of launches puts its own functions here."""
+operators = SimpleNamespace()
+"""What `launch` calls, by name, once the library is known to run: to look an operator up takes a third of a call. A
+recorder of launches puts its own functions here."""
 
 
 def launch(arguments: launches.Launch) -> None:

@@ -8,7 +8,7 @@ tiles and splats; with one it never waits (see `workspace.py`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -25,9 +25,9 @@ from turbogs_plugin.engine.render_pass import (
     Projected,
     Rendered,
     RenderOptions,
+    ScreenGradients,
     ScreenRecords,
     Upstream,
-    require_statistics,
 )
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
@@ -40,43 +40,14 @@ def plain_floats(tensor: Tensor) -> Tensor:
     return tensor.contiguous()
 
 
-def _prepared(tensor: Tensor) -> Tensor:
-    """`plain_floats`, aligned for 16-byte loads."""
-    tensor = plain_floats(tensor)
-    return tensor if tensor.data_ptr() % 16 == 0 else tensor.clone()
+def ready(gaussians: Gaussians) -> Gaussians:
+    """The model as kernels take it: `plain_floats` that are aligned for 16-byte loads; the given one where it is so."""
 
+    def prepared(value: Tensor) -> Tensor:
+        value = plain_floats(value)
+        return value if value.data_ptr() % 16 == 0 else value.clone()
 
-def _check(gaussians: Gaussians) -> None:
-    if gaussians.device.type != "cuda":
-        raise InputError(f"rasterize_cuda: the Gaussians are on {gaussians.device}; move them to a CUDA device")
-    _require(gaussians.items(), torch.float32, gaussians.device)
-
-
-def _check_batch(cameras: Cameras, samples: PixelSamples, device: torch.device) -> None:
-    viewmats, Ks, _ = cameras.by_row()
-    _require((("cameras.viewmats", viewmats), ("cameras.Ks", Ks)), torch.float32, device)
-    integers = ((f"samples.{name}", getattr(samples, name)) for name in ("pixel_ids", "tile_ids", "tile_offsets"))
-    _require(integers, torch.int32, device)
-    require_views(len(cameras))
-    if cameras.sizes.tolist() != samples.sizes.tolist():
-        raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
-
-
-def _require(tensors: Iterable[tuple[str, Tensor]], dtype: torch.dtype, device: torch.device) -> None:
-    for name, tensor in tensors:
-        if tensor.dtype != dtype or tensor.device != device:
-            raise InputError(f"{name} must be {dtype} on {device}, got {tensor.dtype} on {tensor.device}")
-
-
-def _ready(gaussians: Gaussians, workspace: Workspace | None) -> Gaussians:
-    """The model as kernels take it; with a workspace a model is checked once, not at each pass."""
-    if workspace is not None and workspace.knows(gaussians):
-        return gaussians
-    _check(gaussians)
-    ready = gaussians.map(_prepared)
-    if workspace is not None and all(value is getattr(gaussians, name) for name, value in ready.items()):
-        workspace.know(gaussians)
-    return ready
+    return gaussians if all(prepared(value) is value for _, value in gaussians.items()) else gaussians.map(prepared)
 
 
 def warps_per_tile(slots: int, tiles: int) -> int:
@@ -85,7 +56,7 @@ def warps_per_tile(slots: int, tiles: int) -> int:
 
 
 @dataclass
-class CudaScreenGradients:
+class CudaScreenGradients(ScreenGradients):
     """Gradients on the screen (see `ScreenGradients`), and what is needed to take them to the parameters.
 
     Args:
@@ -93,7 +64,6 @@ class CudaScreenGradients:
         samples: the pass's samples.
         records: [K, N, 16] float32, `layout.ScreenRecord`. Where a Gaussian is off screen, a record may hold anything.
         radii: [K, N, 2] int32, zero where off screen.
-        with_statistics: whether the columns that only density control asks for were filled.
         overflow: [1] int32 on the device, or None; if not 0, the pass drew nothing and nothing may change.
     """
 
@@ -101,22 +71,13 @@ class CudaScreenGradients:
     samples: PixelSamples
     records: Tensor
     radii: Tensor
-    with_statistics: bool = False
     overflow: Tensor | None = None
 
-    def full_records(self) -> Tensor:
-        """[K, N, 16] the records, zero where a Gaussian is off screen."""
-        return torch.where((self.radii > 0).any(dim=-1, keepdim=True), self.records, 0.0)
-
     def plain(self) -> ScreenRecords:
-        return ScreenRecords(self.records, self.radii, self.with_statistics)
+        return ScreenRecords(self.records, self.radii)
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
-        """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once.
-
-        The fields that have rows are views of one packed [K, N, 14] tensor. After an overflow they are zero.
-        """
-        library.require()
+        # The fields that have rows are views of one packed [K, N, 14] tensor. After an overflow they are zero.
         gaussians = self.scene.gaussians
         shape = (len(self.records) if rows else 1, len(gaussians))
         # The kernel writes every entry, unless an overflow keeps it from running.
@@ -133,8 +94,6 @@ class CudaScreenGradients:
 
     def backward_arguments(self, stats: GaussianStats | None) -> launches.ScreenBackward:
         """The arguments shared by the launches that take these gradients to the parameters."""
-        require_views(len(self.records))
-        require_statistics(self.with_statistics, stats)
         return launches.ScreenBackward(
             scene=self.scene,
             records=self.records,
@@ -155,24 +114,22 @@ def count_filled(samples: PixelSamples) -> Tensor | None:
     return samples.num_filled
 
 
-def require_views(count: int) -> None:
-    """Raise `InputError` if a batch has no view, or more than the kernels accept."""
-    if not 1 <= count <= layout.MAX_VIEWS:
-        raise InputError(f"a batch takes 1 .. {layout.MAX_VIEWS} views, got {count}")
-
-
 @dataclass
 class CudaRendered(Rendered):
     """One forward pass (see `Rendered`). With a workspace, valid until the next pass."""
 
-    num_intersections: Tensor
-    """[1] int32 on the device: the intersections of tiles and splats of this pass."""
+    _status: Tensor = field(repr=False)  # [2] int32, of `layout.PassStatus`
     _scene: launches.Scene = field(repr=False)
     _samples: PixelSamples = field(repr=False)
     _workspace: Workspace | None = field(repr=False)
     _radii: Tensor = field(repr=False)  # [K, N, 2]
     _forward: launches.RasterForward = field(repr=False)
     _cleared: bool = field(repr=False)  # the projection has cleared the records on screen, for one backward pass
+
+    @property
+    def num_intersections(self) -> Tensor:
+        """[1] int32 on the device: the intersections of tiles and splats of this pass."""
+        return self._status[:1]
 
     @torch.no_grad()
     def projected(self) -> Projected:
@@ -187,13 +144,6 @@ class CudaRendered(Rendered):
         )
 
     def _backward(self, upstream: Upstream, with_statistics: bool) -> CudaScreenGradients:
-        if upstream.depth_gradients is not None and self.depths is None:
-            raise InputError("depth_gradients need a pass with depths: rasterize(..., with_depth=True)")
-        for name, value in vars(upstream).items():
-            like = self.colors if name == "color_gradients" else self.alphas
-            if value is not None and (value.shape, value.dtype, value.device) != (like.shape, like.dtype, like.device):
-                wanted = f"float32 {list(like.shape)} on {like.device}"
-                raise InputError(f"{name} must be {wanted}, got {value.dtype} {list(value.shape)} on {value.device}")
         buffers = Buffers(self._workspace, self.colors.device)
         records = buffers.floats("records", len(self._forward.instances), ScreenRecord.SIZE)
         if not self._cleared:
@@ -202,33 +152,19 @@ class CudaRendered(Rendered):
         self._cleared = False
         overflow = None if self._workspace is None else self._workspace.overflow
         records = records.view(*self._radii.shape[:2], ScreenRecord.SIZE)
-        return CudaScreenGradients(self._scene, self._samples, records, self._radii, with_statistics, overflow)
+        return CudaScreenGradients(self._scene, self._samples, records, self._radii, overflow)
 
 
-def screen_gradients(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    samples: PixelSamples,
-    options: RenderOptions,
-    plain: ScreenRecords,
-    workspace: Workspace | None = None,
-) -> CudaScreenGradients:
-    """`Engine.screen_gradients`. The Gaussians are contiguous, and their rows begin at a multiple of four."""
-    library.require()
-    scene = _scene(_ready(gaussians, workspace), cameras, options.used_degree(gaussians), options.settings.eps2d)
-    overflow = None if workspace is None else workspace.overflow
-    return CudaScreenGradients(scene, samples, plain.records, plain.radii, plain.with_statistics, overflow)
-
-
-def _scene(gaussians: Gaussians, cameras: Cameras, sh_degree: int, eps2d: float) -> launches.Scene:
+def scene_of(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> launches.Scene:
+    """What a pass draws, of Gaussians that are `ready`."""
     viewmats, Ks, rows = cameras.by_row()
     return launches.Scene(
         gaussians=gaussians,
         viewmats=plain_floats(viewmats),
         Ks=plain_floats(Ks),
         images=[number for size, row in zip(cameras.sizes.tolist(), rows, strict=True) for number in (*size, row)],
-        sh_degree=sh_degree,
-        eps2d=eps2d,
+        sh_degree=options.used_degree(gaussians),
+        eps2d=options.settings.eps2d,
     )
 
 
@@ -253,36 +189,27 @@ class Buffers:
         return of_sizes() if self.workspace is None else self.workspace.kept(name, sizes, of_sizes)
 
 
-@dataclass(frozen=True)
-class _Front:
-    """Buffers of the projection and of the count of intersections."""
-
-    splats: launches.Splats
-    tiles: launches.TileLists
-    num_intersections: Tensor  # the first number of `tiles.status`
-    block_sums: Tensor
-    records: Tensor | None
-
-    @classmethod
-    def of(cls, buffers: Buffers, views: int, count: int, num_active: int, num_tiles: int) -> _Front:
-        workspace = buffers.workspace
-        splats = launches.Splats(
-            cameras=buffers.floats("cameras", views, layout.CameraRow.SIZE),
-            instances=buffers.floats("instances", views * count, InstanceRow.SIZE),
-            radii=buffers.integers("radii", views, count, 2),
-            active_prefix=None if num_active == num_tiles else buffers.integers("active_prefix", num_tiles + 1),
-        )
-        tiles = launches.TileLists(
-            tile_cursors=buffers.integers("tile_cursors", num_active + 1),
-            tile_starts=buffers.integers("tile_starts", num_active + 1),
-            status=torch.zeros(2, dtype=torch.int32, device=buffers.device) if workspace is None else workspace.status,
-            counters=buffers.integers("counters", 2),
-        )
-        blocks = max(1, math.ceil(num_active / layout.SCAN_TILES))
-        block_sums = buffers.integers("block_sums", blocks, 2, dtype=torch.int64)
-        # With a workspace a backward pass is likely to follow.
-        records = None if workspace is None else buffers.floats("records", views * count, ScreenRecord.SIZE)
-        return cls(splats, tiles, tiles.status[:1], block_sums, records)
+def _front_arrays(
+    buffers: Buffers, views: int, count: int, num_active: int, num_tiles: int
+) -> tuple[launches.Splats, launches.TileLists, Tensor, Tensor | None]:
+    """What the projection and the count of intersections write: splats, lists of tiles, sums of blocks, records."""
+    workspace = buffers.workspace
+    splats = launches.Splats(
+        cameras=buffers.floats("cameras", views, layout.CameraRow.SIZE),
+        instances=buffers.floats("instances", views * count, InstanceRow.SIZE),
+        radii=buffers.integers("radii", views, count, 2),
+        active_prefix=None if num_active == num_tiles else buffers.integers("active_prefix", num_tiles + 1),
+    )
+    tiles = launches.TileLists(
+        tile_cursors=buffers.integers("tile_cursors", num_active + 1),
+        tile_starts=buffers.integers("tile_starts", num_active + 1),
+        status=torch.zeros(2, dtype=torch.int32, device=buffers.device) if workspace is None else workspace.status,
+        counters=buffers.integers("counters", 2),
+    )
+    block_sums = buffers.integers("block_sums", max(1, math.ceil(num_active / layout.SCAN_TILES)), 2, dtype=torch.int64)
+    # With a workspace a backward pass is likely to follow.
+    records = None if workspace is None else buffers.floats("records", views * count, ScreenRecord.SIZE)
+    return splats, tiles, block_sums, records
 
 
 def _intersection_arrays(buffers: Buffers, capacity: int) -> launches.Intersections:
@@ -319,30 +246,27 @@ def rasterize_cuda(
         workspace: memory to reuse, so that nothing waits for the GPU; `Workspace` says what the caller must then do.
 
     Raises:
-        InputError: no kernels here, a tensor of wrong dtype or device, or more intersections than a pass can have.
+        InputError: cameras of other image sizes than the samples', or more intersections than a pass can have.
+        RuntimeError: a tensor of wrong shape, dtype or device; the message names it.
     """
-    library.require()
-    degree, settings = options.used_degree(gaussians), options.settings
-    gaussians = _ready(gaussians, workspace)
-    device = gaussians.device
-    _check_batch(cameras, samples, device)
+    if cameras.sizes.tolist() != samples.sizes.tolist():
+        raise InputError("cameras and samples differ in their image sizes: select the cameras of samples.view_ids")
+    scene = scene_of(ready(gaussians), cameras, options)
+    settings, device = options.settings, gaussians.device
     buffers = Buffers(workspace, device)
     views, count, slots = len(cameras), len(gaussians), len(samples)
     num_tiles, num_active = len(samples.grid), len(samples.tile_ids)
 
     # A pass over every tile needs no table of the active ones.
-    everywhere = num_active == num_tiles
-    tile_ids = None if everywhere else samples.tile_ids.contiguous()
-    scene = _scene(gaussians, cameras, degree, settings.eps2d)
-    front = buffers.kept("front", _Front.of, views, count, num_active, num_tiles)
-    splats, tiles = front.splats, front.tiles
+    tile_ids = None if num_active == num_tiles else samples.tile_ids.contiguous()
+    splats, tiles, block_sums, records = buffers.kept("front", _front_arrays, views, count, num_active, num_tiles)
     grid = launches.GridOrigin(*samples.origin)
-    arrays = (splats, tile_ids, tiles.tile_cursors, front.records)
+    arrays = (splats, tile_ids, tiles.tile_cursors, records)
     library.launch(launches.RasterProject(scene, grid, settings, options.dropout, *arrays))
 
     capacity = None if workspace is None else workspace.capacity(count, num_active)
     most = layout.INTERSECTIONS_MAX if capacity is None else capacity
-    library.launch(launches.RasterCountIntersections(tiles, front.block_sums, most))
+    library.launch(launches.RasterCountIntersections(tiles, block_sums, most))
     if capacity is None:
         found = int(tiles.status[0])
         require_possible(found)
@@ -373,7 +297,7 @@ def rasterize_cuda(
         forward.pixels.colors,
         forward.pixels.alphas,
         forward.depths,
-        num_intersections=front.num_intersections,
+        _status=tiles.status,
         _scene=scene,
         _samples=samples,
         _workspace=workspace,

@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
-from weakref import ref
 
 import torch
 from torch import Tensor
@@ -23,7 +22,6 @@ from torch import Tensor
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX, PassStatus
 from turbogs_plugin.engine.shared import PassMemory
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.types import Gaussians
 
 Kept = TypeVar("Kept")
 
@@ -87,6 +85,7 @@ class Workspace:
 
     Attributes:
         status: [2] int32 on the device, of `layout.PassStatus`: intersections of the latest pass; the overflow flag.
+        overflow: [1] int32 of `status`, not 0 while passes do nothing. Kernels that change state must check it.
         passes: number of passes begun.
     """
 
@@ -105,15 +104,9 @@ class Workspace:
         self._gaussians = 0
         self._intersections_per_tile = 0.0
         self._first_lost: int | None = None
-        self._known: dict[int, ref[Gaussians]] = {}  # by identity
 
     def _set_status(self, status: Tensor) -> None:
-        self.status, self._overflow = status, status[PassStatus.OVERFLOW :]
-
-    @property
-    def overflow(self) -> Tensor:
-        """[1] int32 on the device, not 0 while passes do nothing. Kernels that change state must check it."""
-        return self._overflow
+        self.status, self.overflow = status, status[PassStatus.OVERFLOW :]
 
     def buffer(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """The buffer of this name, uninitialised; it grows if needed."""
@@ -126,8 +119,7 @@ class Workspace:
             self._views.pop(name, None)
             self._buffers.pop(name, None)  # freed before its successor is made
             held = self._buffers[name] = torch.empty(int(count * GROWTH) + 1, dtype=dtype, device=self.device)
-        strides = [math.prod(shape[place + 1 :]) for place in range(len(shape))]
-        view = self._views[name] = held.as_strided(shape, strides)  # in one operation
+        view = self._views[name] = held[:count].view(shape)
         return view
 
     def lend(self, memory: PassMemory | None) -> None:
@@ -138,30 +130,17 @@ class Workspace:
         Args:
             memory: None: all are the workspace's own again.
         """
-        if memory is not self._lent:
-            status = torch.empty_like(self.status) if memory is None else memory.status[: len(self.status)]
-            self._set_status(status.copy_(self.status))
-            self._kept.clear()  # holds views of buffers
+        lent = {} if memory is None else {name: getattr(memory, name) for name in LENT}
+        if memory is self._lent and all(self._buffers.get(name) is value for name, value in lent.items()):
+            return
+        status = torch.empty_like(self.status) if memory is None else memory.status[: len(self.status)]
+        self._set_status(status.copy_(self.status))
+        self._kept.clear()  # holds views of buffers
         for name in LENT:
-            held, lent = self._buffers.get(name), None if memory is None else getattr(memory, name)
-            if held is lent or (lent is None and (self._lent is None or held is not getattr(self._lent, name))):
-                continue
-            self._kept.clear()
             self._views.pop(name, None)
             self._buffers.pop(name, None)
-            if lent is not None:
-                self._buffers[name] = lent
+        self._buffers.update(lent)
         self._lent = memory
-
-    def know(self, gaussians: Gaussians) -> None:
-        """Remember that this model's tensors are as kernels take them, as long as it lives."""
-        self._known = {place: known for place, known in self._known.items() if known() is not None}
-        self._known[id(gaussians)] = ref(gaussians)
-
-    def knows(self, gaussians: Gaussians) -> bool:
-        """Whether a model is remembered: its tensors need no look at each pass, as operators look at them, too."""
-        known = self._known.get(id(gaussians))
-        return known is not None and known() is gaussians
 
     def kept(self, name: str, sizes: tuple, make: Callable[[], Kept]) -> Kept:
         """Result of `make`, made anew only where `sizes` differ from the last call of this name.
@@ -181,10 +160,6 @@ class Workspace:
         if not self._zeros:
             self._zeros.extend(torch.zeros(ZEROS_AT_ONCE, dtype=torch.float64, device=self.device).unbind())
         return self._zeros.pop()
-
-    def bytes_held(self) -> int:
-        """Bytes of all buffers."""
-        return sum(held.numel() * held.element_size() for held in self._buffers.values())
 
     def capacity(self, gaussians: int, tiles: int) -> int | None:
         """Number of intersections that a pass gets memory for, or None if nothing is known yet.

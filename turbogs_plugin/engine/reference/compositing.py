@@ -15,6 +15,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference.intersection import Intersections
+from turbogs_plugin.engine.reference.projection import Splats
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.types import PixelSamples
 
@@ -40,20 +41,19 @@ class Block:
 
 @dataclass
 class Compositor:
-    """Inputs of compositing beside the splats: intersections, pixels and settings.
+    """Composites the splats of a pass, and takes gradients back to them.
 
     Args:
         intersections: the M intersections of the T tiles.
         samples: the P samples.
         settings: thresholds.
+        table: [10, R] the splats, see `splat_table`.
     """
 
     intersections: Intersections
     samples: PixelSamples
     settings: RasterSettings
-
-    def __post_init__(self) -> None:
-        self.device = self.intersections.rows.device
+    table: Tensor
 
     def blocks(self) -> Iterator[Block]:
         """All tiles that have both samples and intersections, those with the most intersections first."""
@@ -64,7 +64,7 @@ class Compositor:
         sample_counts, sample_starts = offsets.diff()[order], offsets[:-1][order]
         host_sample_counts = sample_counts.tolist()
         starts = (tile_counts.cumsum(0) - tile_counts)[order]
-        limit = BLOCK_ELEMENTS[self.device.type]
+        limit = BLOCK_ELEMENTS[self.table.device.type]
 
         begin = 0
         while begin < len(counts) and counts[begin] > 0:
@@ -74,36 +74,71 @@ class Compositor:
                 if end > begin and (end + 1 - begin) * most * min(depth, SLICE_SPLATS) > limit:
                     break
                 most_samples, end = most, end + 1
-            number = torch.arange(most_samples, device=self.device)
+            number = torch.arange(most_samples, device=self.table.device)
             slots = sample_starts[begin:end, None] + number
             slots = slots.masked_fill_(number >= sample_counts[begin:end, None], len(self.samples))
             yield Block(slots, starts[begin:end], device_counts[begin:end], depth)
             begin = end
 
-    def slices(self, table: Tensor) -> Iterator[tuple[Block, Tensor, Tensor, Slice]]:
+    def slices(self) -> Iterator[tuple[Block, Tensor, Tensor, Slice]]:
         """Every slice of every block; a block's slices come front to back, until all its pixels are opaque.
-
-        Args:
-            table: see `splat_table`.
 
         Yields:
             The block; numbers [B, G] of the slice's intersections; which of them are real, not padding; the slice.
         """
-        centers = self.samples.coordinates().to(table.dtype) + 0.5
+        centers = self.samples.coordinates().to(self.table.dtype) + 0.5
         centers = torch.cat([centers, centers.new_zeros(1, 2)])  # [P + 1, 2], the last of them padding
         for block in self.blocks():
             block_centers = centers[block.samples]  # [B, S, 2]
             transmittance = torch.ones_like(block_centers[:, :, :1])
             for first in range(0, block.depth, SLICE_SPLATS):
-                number = torch.arange(first, min(first + SLICE_SPLATS, block.depth), device=self.device)
+                number = torch.arange(first, min(first + SLICE_SPLATS, block.depth), device=self.table.device)
                 real = number < block.count[:, None]
                 numbers = torch.where(real, block.start[:, None] + number, 0)
                 rows = self.intersections.rows[numbers]
-                piece = composite_slice(table, rows, real, block_centers, transmittance, self.settings)
+                piece = composite_slice(self.table, rows, real, block_centers, transmittance, self.settings)
                 yield block, numbers, real, piece
                 transmittance = piece.transmittance
                 if not transmittance.any():
                     break
+
+    def forward(self) -> Tensor:
+        """Composite all samples.
+
+        Returns:
+            [P, 5]: sums of weight times (red, green, blue, 1, depth). Zero in empty slots.
+        """
+        sums = self.table.new_zeros(len(self.samples) + 1, 5)
+        for block, _, _, piece in self.slices():
+            sums[block.samples] = sums[block.samples].baddbmm_(piece.weights, piece.features.transpose(1, 2))
+        return sums[:-1] * self.samples.filled[:, None]
+
+    def backward(self, sums: Tensor, gradients: Tensor, pixel_errors: Tensor) -> Tensor:
+        """Take the gradients of `forward` to the splats.
+
+        The weights are composited a second time, front to back. The contribution behind a splat is the pixel's total
+        minus what has been seen of it, so nothing is divided by a small transmittance.
+
+        Args:
+            sums: result of `forward`.
+            gradients: [P, 5], d loss / d sums.
+            pixel_errors: [P].
+
+        Returns:
+            [R, 16], see `layout.ScreenRecord`.
+        """
+        intersections, filled = self.intersections, self.samples.filled[:, None]
+        # Red, green, blue, alpha, depth, error, 1. Zero in the padding slot and in empty ones.
+        upstream = torch.cat([gradients, pixel_errors[:, None].to(sums.dtype), torch.ones_like(sums[:, :1])], dim=1)
+        upstream = torch.where(filled, upstream, 0.0)
+        upstream = torch.cat([upstream, upstream.new_zeros(1, 7)])
+        totals = torch.cat([(upstream[:-1, :5] * sums).sum(dim=1, keepdim=True), sums.new_zeros(1, 1)])
+        records = self.table.new_zeros(len(intersections.rows), ScreenRecord.SIZE)
+        for block, numbers, real, piece in self.slices():
+            # `totals` [P + 1, 1]: the contribution of the splats still to come
+            record, totals[block.samples] = _slice_backward(piece, upstream[block.samples], totals[block.samples])
+            records[intersections.slots[numbers[real]]] = record[real]
+        return intersections.sum_by_row(records)
 
 
 @dataclass
@@ -164,53 +199,10 @@ def composite_slice(
     return Slice(features, conics, opacities, dx, dy, sigma, alpha, clamped, weights, behind)
 
 
-def splat_table(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, depths: Tensor) -> Tensor:
+def splat_table(splats: Splats) -> Tensor:
     """[10, R], the channels that `composite_slice` lists."""
-    columns = [means2d, conics, opacities[:, None], colors, depths[:, None]]
+    columns = [splats.means2d, splats.conics, splats.opacities[:, None], splats.colors, splats.depths[:, None]]
     return torch.cat(columns, dim=1).T.contiguous()
-
-
-def composite(compositor: Compositor, table: Tensor) -> Tensor:
-    """Composite all samples.
-
-    Returns:
-        [P, 5]: sums of weight times (red, green, blue, 1, depth). Zero in empty slots.
-    """
-    samples = compositor.samples
-    sums = table.new_zeros(len(samples) + 1, 5)
-    for block, _, _, piece in compositor.slices(table):
-        sums[block.samples] = sums[block.samples].baddbmm_(piece.weights, piece.features.transpose(1, 2))
-    return sums[:-1] * samples.filled[:, None]
-
-
-def composite_backward(
-    compositor: Compositor, table: Tensor, sums: Tensor, gradients: Tensor, pixel_errors: Tensor
-) -> Tensor:
-    """Take the gradients of `composite` to the splats.
-
-    The weights are composited a second time, front to back. The contribution behind a splat is the pixel's total minus
-    what has been seen of it, so nothing is divided by a small transmittance.
-
-    Args:
-        table, sums: the argument and the result of `composite`.
-        gradients: [P, 5], d loss / d sums.
-        pixel_errors: [P].
-
-    Returns:
-        [R, 16], see `layout.ScreenRecord`.
-    """
-    intersections, filled = compositor.intersections, compositor.samples.filled[:, None]
-    # Red, green, blue, alpha, depth, error, 1. Zero in the padding slot and in empty ones.
-    upstream = torch.cat([gradients, pixel_errors[:, None].to(sums.dtype), torch.ones_like(sums[:, :1])], dim=1)
-    upstream = torch.where(filled, upstream, 0.0)
-    upstream = torch.cat([upstream, upstream.new_zeros(1, 7)])
-    totals = torch.cat([(upstream[:-1, :5] * sums).sum(dim=1, keepdim=True), sums.new_zeros(1, 1)])
-    records = table.new_zeros(len(intersections.rows), ScreenRecord.SIZE)
-    for block, numbers, real, piece in compositor.slices(table):
-        # `totals` [P + 1, 1]: the contribution of the splats still to come
-        record, totals[block.samples] = _slice_backward(piece, upstream[block.samples], totals[block.samples])
-        records[intersections.slots[numbers[real]]] = record[real]
-    return intersections.sum_by_row(records)
 
 
 def _slice_backward(piece: Slice, upstream: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:

@@ -40,20 +40,14 @@ another pixel is no unit either. The number of a tile within its view is then th
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.reference.philox import (
-    PURPOSE_PIXELS,
-    PURPOSE_TILES,
-    Words,
-    exponentials,
-    random_words,
-)
+from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, PURPOSE_TILES, Words, exponentials, random_words
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds, compact, pixel_table, slots_of_tiles
@@ -169,75 +163,58 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
     def words(place: Tensor, purpose: int) -> Words:
         return random_words(place.clamp(min=0).long(), view_numbers, purpose, step.seed, step.iteration)
 
-    draw = _draw_tiles if rule.unit == "tile" else _draw_pixels
-    return draw(_Batch(view_ids, sizes, origin, table, exist, counts, tile_ids, errors, ages, words), rate, rule)
-
-
-@dataclass(frozen=True)
-class _Batch:
-    """The tiles of K views, or their live tiles, with all their pixels; `words` gives the random words of places [T,
-    ...]."""
-
-    view_ids: tuple[int, ...]
-    sizes: np.ndarray
-    origin: tuple[int, int]
-    table: Tensor  # [T, 256] int32
-    exist: Tensor  # [T, 256] bool, the pixel is in the image and not masked
-    counts: np.ndarray  # [K] tiles of each view
-    live_tiles: Tensor | None  # [T] int64 ids of the tiles where there are masks; None: all tiles
-    errors: Tensor  # [T, 256] float64
-    ages: Tensor  # [T, 256] int32
-    words: Callable[[Tensor, int], Words]
-
-    def ends(self, unit: str, wanted: Sequence[int]) -> DrawEnds:
-        """`PixelSamples.host_ends` for `wanted` units drawn of each view, or of each of its tiles."""
-        live = None if self.live_tiles is None else tuple(self.counts.tolist())
-        return DrawEnds(unit, tuple(map(tuple, self.sizes.tolist())), tuple(wanted), live)
-
-
-def _draw_pixels(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
-    """Pixels as units, drawn from each tile."""
-    wanted = rule.wanted(rate, TILE_PIXELS)
-    words = batch.words(batch.table, PURPOSE_PIXELS)
-    drawn, probabilities = draw_units(Units(batch.errors, batch.ages, batch.exist, words, wanted), rule)
-    weights = None if probabilities is None else _importance_weights(probabilities, rule)
-    if batch.live_tiles is None:
-        slots = slots_of_tiles(wanted, batch.sizes)
-        tile_ids, full = torch.arange(len(batch.table), dtype=torch.int32, device=batch.table.device), True
+    live = None if tile_ids is None else tuple(counts.tolist())
+    if rule.unit == "tile":
+        chosen, weights, wanted = _draw_tiles(errors.sum(dim=1), ages.amax(dim=1), counts, words, rate, rule)
+        table, drawn, slots = table[chosen], exist[chosen], np.full(len(chosen), TILE_PIXELS)
+        weights = None if weights is None else weights[:, None].expand(table.shape)
+        tile_ids = chosen if tile_ids is None else tile_ids[chosen]
     else:
-        slots, tile_ids, full = np.full(len(batch.table), wanted), batch.live_tiles.int(), False
-    samples = compact(batch.view_ids, batch.sizes, batch.table, drawn, tile_ids, slots, weights, full=full)
-    return replace(samples, host_ends=batch.ends(rule.unit, [wanted] * len(batch.counts)))
+        wanted = [rule.wanted(rate, TILE_PIXELS)] * len(counts)
+        drawn, probabilities = draw_units(Units(errors, ages, exist, words(table, PURPOSE_PIXELS), wanted[0]), rule)
+        weights = None if probabilities is None else _importance_weights(probabilities, rule)
+        slots = slots_of_tiles(wanted[0], sizes) if live is None else np.full(len(table), wanted[0])
+        tile_ids = torch.arange(len(table), device=device) if tile_ids is None else tile_ids
+    full = rule.unit == "pixel" and live is None
+    samples = compact(view_ids, sizes, table, drawn, tile_ids.int(), slots, weights, full=full, origin=origin)
+    return replace(samples, host_ends=DrawEnds(rule.unit, tuple(map(tuple, sizes.tolist())), tuple(wanted), live))
 
 
-def _draw_tiles(batch: _Batch, rate: float, rule: DrawRule) -> PixelSamples:
-    """Whole tiles as units, drawn from each view."""
-    device, ends = batch.table.device, np.concatenate([[0], np.cumsum(batch.counts)])
-    errors, ages = batch.errors.sum(dim=1), batch.ages.amax(dim=1)  # [T]
-    tiles = torch.arange(len(batch.table), device=device)
+def _draw_tiles(
+    errors: Tensor,
+    ages: Tensor,
+    counts: np.ndarray,
+    words: Callable[[Tensor, int], Words],
+    rate: float,
+    rule: DrawRule,
+) -> tuple[Tensor, Tensor | None, list[int]]:
+    """Whole tiles as units, drawn from each view.
+
+    Args:
+        errors, ages: [T] of the tiles.
+        counts: [K] tiles of each view.
+        words: gives the random words of places [T, 1].
+
+    Returns:
+        Positions of the chosen tiles among the T, and their importance weights, if any; the number chosen of each view.
+    """
+    device, ends = errors.device, np.concatenate([[0], np.cumsum(counts)])
+    tiles = torch.arange(len(errors), device=device)
     firsts = torch.as_tensor(np.repeat(ends[:-1], np.diff(ends)), device=device)
-    words = batch.words((tiles - firsts)[:, None], PURPOSE_TILES)  # of the numbers within the view
+    of_tiles = words((tiles - firsts)[:, None], PURPOSE_TILES)  # of the numbers within the view
     chosen, weights, numbers = [], [], []
     for first, end in itertools.pairwise(ends.tolist()):
         row = slice(first, end)
         wanted = rule.wanted(rate, end - first)
         numbers.append(wanted)
         exist = torch.ones(1, end - first, dtype=torch.bool, device=device)
-        x0, x1, x2, x3 = (word[row].T for word in words)
-        units = Units(errors[None, row], ages[None, row], exist, (x0, x1, x2, x3), wanted)
-        drawn, probabilities = draw_units(units, rule)
+        x0, x1, x2, x3 = (word[row].T for word in of_tiles)
+        drawn, probabilities = draw_units(
+            Units(errors[None, row], ages[None, row], exist, (x0, x1, x2, x3), wanted), rule
+        )
         # Their number is known here; a boolean index would wait for the device.
         tile_ids = torch.argsort(drawn[0].to(torch.int8), stable=True, descending=True)[:wanted]
         chosen.append(first + tile_ids)
         if probabilities is not None:
             weights.append(_importance_weights(probabilities, rule)[0, tile_ids])
-    tile_ids = torch.cat(chosen)
-    table, exist = batch.table[tile_ids], batch.exist[tile_ids]
-    tile_weights = torch.cat(weights)[:, None].expand(table.shape) if rule.importance else None
-    slots = np.full(len(tile_ids), TILE_PIXELS)
-    if batch.live_tiles is not None:
-        tile_ids = batch.live_tiles[tile_ids]
-    samples = compact(
-        batch.view_ids, batch.sizes, table, exist, tile_ids.int(), slots, tile_weights, origin=batch.origin
-    )
-    return replace(samples, host_ends=batch.ends(rule.unit, numbers))
+    return torch.cat(chosen), torch.cat(weights) if weights else None, numbers

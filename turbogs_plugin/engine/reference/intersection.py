@@ -46,20 +46,6 @@ class Intersections:
         return torch.zeros_like(sums).index_copy(0, self.row_order, sums)
 
 
-def spread(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Lay `counts[i]` items for every ``i`` end to end.
-
-    Args:
-        counts: [R] int64.
-
-    Returns:
-        Owner ``i`` of each item and its number within the owner, both [sum of counts] int64.
-    """
-    owners = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
-    starts = counts.cumsum(0) - counts
-    return owners, torch.arange(len(owners), device=counts.device) - starts[owners]
-
-
 def smallest_exponents(conics: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """A lower bound, tight to rounding, of ``sigma = (a dx^2 + c dy^2) / 2 + b dx dy`` over rectangles.
 
@@ -117,7 +103,9 @@ def intersect_tiles(rows: Rows, splats: Splats, samples: PixelSamples, settings:
     last = (torch.minimum(last, (image - 1).to(last.dtype)).floor().long() + origin) // TILE_SIZE
     spans = (last - first + 1).clamp(min=0) * on_screen[order, None]  # [R, 2] tiles in x and y
 
-    owners, number = spread(spans.prod(dim=-1))  # [C] candidates
+    counts = spans.prod(dim=-1)  # [R] candidates of each row, C in all
+    owners = torch.repeat_interleave(torch.arange(len(counts), device=device), counts)  # [C]
+    number = torch.arange(len(owners), device=device) - (counts.cumsum(0) - counts)[owners]  # [C] within the owner
     column = number % spans[owners, 0] + first[owners, 0]
     line = number // spans[owners, 0] + first[owners, 1]
     tiles = position[offsets[rows.views[order]][owners] + line * shapes[rows.views[order]][owners, 0] + column]

@@ -13,8 +13,6 @@ Notation, per tile and channel: n samples x (prediction) and y (truth) with impo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -31,7 +29,7 @@ def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: Pixe
     """The loss of some samples and its gradient::
 
         L = l1_weight * l1 + structure_weight * mean over tiles of f * mean over channels of (1 - S)
-        f = lambda with `balance`, else 1
+        f = lambda where `LossTerms.balance`, else 1
         lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
 
     l1 is the Charbonnier term of `_Problem`, S the similarity named by `structure`. ``grad l1`` is
@@ -61,31 +59,22 @@ def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: Pixe
     return LossOutput(loss, gradients, problem.pixel_errors)
 
 
-@dataclass
-class TileMoments:
+def tile_moments(problem: _Problem) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Second moments of prediction (x) and truth (y) of each tile and channel.
 
-    Args:
-        variance_x, variance_y, covariance: [T, C].
-        offset_x, offset_y: [P, C], the samples minus their tile's mean.
+    Two passes, relative to the tile's first sample, so a constant tile has variance 0 exactly.
+
+    Returns:
+        Variance of x, variance of y and covariance, [T, C]; and the samples x and y minus their tile's mean, [P, C].
     """
-
-    variance_x: Tensor
-    variance_y: Tensor
-    covariance: Tensor
-    offset_x: Tensor
-    offset_y: Tensor
-
-    @classmethod
-    def of(cls, groups: TileGroups, colors: Tensor, targets: Tensor) -> TileMoments:
-        """Two passes, relative to the tile's first sample, so a constant tile has variance 0 exactly."""
-        first_x, first_y = colors[groups.first_slots], targets[groups.first_slots]
-        relative_x, relative_y = colors - groups.spread(first_x), targets - groups.spread(first_y)
-        mean_x, mean_y = groups.mean(torch.cat([relative_x, relative_y], dim=1)).chunk(2, dim=1)
-        offset_x, offset_y = relative_x - groups.spread(mean_x), relative_y - groups.spread(mean_y)
-        products = torch.cat([offset_x * offset_x, offset_y * offset_y, offset_x * offset_y], dim=1)
-        variance_x, variance_y, covariance = groups.mean(products).chunk(3, dim=1)
-        return cls(variance_x, variance_y, covariance, offset_x, offset_y)
+    groups, colors, targets = problem.groups, problem.colors, problem.targets
+    first_x, first_y = colors[groups.first_slots], targets[groups.first_slots]
+    relative_x, relative_y = colors - groups.spread(first_x), targets - groups.spread(first_y)
+    mean_x, mean_y = groups.mean(torch.cat([relative_x, relative_y], dim=1)).chunk(2, dim=1)
+    offset_x, offset_y = relative_x - groups.spread(mean_x), relative_y - groups.spread(mean_y)
+    products = torch.cat([offset_x * offset_x, offset_y * offset_y, offset_x * offset_y], dim=1)
+    variance_x, variance_y, covariance = groups.mean(products).chunk(3, dim=1)
+    return variance_x, variance_y, covariance, offset_x, offset_y
 
 
 Similarity = tuple[Tensor, Tensor]
@@ -101,11 +90,12 @@ def correlation(problem: _Problem, constant: float) -> Similarity:
     Where variances exceed f this is the paper's NCC. As the floor is in numerator and denominator, S = 1 and g = 0
     where x = y, in tiles of one sample, and in tiles constant in both x and y. ``|omega g| <= 1.5 sqrt(omega / f)``.
     """
-    moments, groups, floor = problem.moments, problem.groups, 0.5 * constant
-    scale_x, scale_y = (moments.variance_x + floor).sqrt(), (moments.variance_y + floor).sqrt()
-    similarity = (moments.covariance + floor) / scale_x / scale_y
+    variance_x, variance_y, covariance, offset_x, offset_y = tile_moments(problem)
+    spread, floor = problem.groups.spread, 0.5 * constant
+    scale_x, scale_y = (variance_x + floor).sqrt(), (variance_y + floor).sqrt()
+    similarity = (covariance + floor) / scale_x / scale_y
     slope_y, slope_x = 1.0 / scale_x / scale_y, similarity / scale_x / scale_x
-    return similarity, moments.offset_y * groups.spread(slope_y) - moments.offset_x * groups.spread(slope_x)
+    return similarity, offset_y * spread(slope_y) - offset_x * spread(slope_x)
 
 
 def printed_correlation(problem: _Problem, constant: float) -> Similarity:
@@ -117,11 +107,11 @@ def printed_correlation(problem: _Problem, constant: float) -> Similarity:
     A flat tile scores 0, and a faint texture scores near 0, as epsilon is added to a product of two variances. There g
     is not quite the derivative of S, which has s_y^2 / (s_x^2 s_y^2 + epsilon) in the place of 1 / (s_x^2 + epsilon).
     """
-    moments, groups = problem.moments, problem.groups
-    scale = (moments.variance_x * moments.variance_y + constant).sqrt()
-    similarity = moments.covariance / scale
-    slope_x = similarity / (moments.variance_x + constant)
-    return similarity, moments.offset_y * groups.spread(1.0 / scale) - moments.offset_x * groups.spread(slope_x)
+    variance_x, variance_y, covariance, offset_x, offset_y = tile_moments(problem)
+    spread, scale = problem.groups.spread, (variance_x * variance_y + constant).sqrt()
+    similarity = covariance / scale
+    slope_x = similarity / (variance_x + constant)
+    return similarity, offset_y * spread(1.0 / scale) - offset_x * spread(slope_x)
 
 
 def ssim(problem: _Problem, constant: float) -> Similarity:
@@ -165,10 +155,6 @@ class _Problem:
         values = differences * self.slopes * (roots / (roots + epsilon))  # d^2 / (root + eps) = root - eps
         self.loss = (groups.weights * values).sum() / (3.0 * groups.filled)
         self.gradients = self.slopes * (groups.weights / (3.0 * groups.filled))
-
-    @cached_property
-    def moments(self) -> TileMoments:
-        return TileMoments.of(self.groups, self.colors, self.targets)
 
 
 class TileGroups:
@@ -234,7 +220,9 @@ def window_similarity(
     Returns:
         S and h, [P, 3] each.
     """
-    places = _pixel_places(samples, groups.tile_of_slot)
+    inside = (samples.coordinates() + torch.tensor(samples.origin, device=samples.pixel_ids.device)) % TILE_SIZE
+    # [P] the place of each slot among the pixels of all T tiles, row by row in a tile; in empty slots any
+    places = (groups.tile_of_slot * TILE_SIZE + inside[:, 1]) * TILE_SIZE + inside[:, 0]
     first_x, first_y = groups.spread(colors[groups.first_slots]), groups.spread(targets[groups.first_slots])  # [P, 3]
     x, y = colors - first_x, targets - first_y
 
@@ -263,12 +251,6 @@ def window_similarity(
     terms = torch.cat([at_y, at_x, constant - at_y * mean_y + at_x * mean_x], dim=1) * inverse_totals
     sum_y, sum_x, rest = windows(terms).chunk(3, dim=1)
     return structure * luminance, sum_y * y - sum_x * x + rest
-
-
-def _pixel_places(samples: PixelSamples, tile_of_slot: Tensor) -> Tensor:
-    """[P] int64: the place of each slot among the pixels of all T tiles, row by row in a tile; in empty slots any."""
-    inside = (samples.coordinates() + torch.tensor(samples.origin, device=samples.pixel_ids.device)) % TILE_SIZE
-    return (tile_of_slot * TILE_SIZE + inside[:, 1]) * TILE_SIZE + inside[:, 0]
 
 
 def _sum_windows(values: Tensor, places: Tensor, tiles: int) -> Tensor:

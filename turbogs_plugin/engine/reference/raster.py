@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.layout import ScreenRecord
-from turbogs_plugin.engine.reference import compositing
-from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Compositor
+from turbogs_plugin.engine.reference.compositing import ALPHA_TINY, Compositor, splat_table
 from turbogs_plugin.engine.reference.intersection import intersect_tiles
 from turbogs_plugin.engine.reference.philox import PURPOSE_DROPOUT, random_words
 from turbogs_plugin.engine.reference.projection import Rows, Splats, drawable_rows, project_rows
@@ -18,16 +17,16 @@ from turbogs_plugin.engine.render_pass import (
     Projected,
     Rendered,
     RenderOptions,
+    ScreenGradients,
     ScreenRecords,
     Upstream,
-    require_statistics,
 )
 from turbogs_plugin.engine.rules import Dropout
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras, GaussianGradients, Gaussians, GaussianStats, PixelSamples
 
 
 @dataclass
-class ReferenceScreenGradients:
+class ReferenceScreenGradients(ScreenGradients):
     """Gradients on the screen (see `ScreenGradients`).
 
     Args:
@@ -36,7 +35,6 @@ class ReferenceScreenGradients:
         leaves: the parameters of the rows, see `Rows.take`.
         records: [R, 16], see `layout.ScreenRecord`.
         samples: the pass's samples.
-        with_statistics: whether the pass summed up statistics.
     """
 
     rows: Rows
@@ -44,18 +42,11 @@ class ReferenceScreenGradients:
     leaves: Gaussians
     records: Tensor
     samples: PixelSamples
-    with_statistics: bool = False
-
-    def full_records(self) -> Tensor:
-        """[K, N, 16], zero where a Gaussian is not drawn."""
-        return self.rows.scatter(self.records)
 
     def plain(self) -> ScreenRecords:
-        return ScreenRecords(self.full_records(), self.rows.scatter(self.splats.radii), self.with_statistics)
+        return ScreenRecords(self.rows.scatter(self.records), self.rows.scatter(self.splats.radii))
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
-        """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once."""
-        require_statistics(self.with_statistics, stats)
         records, splats = self.records, self.splats
         outputs = (splats.means2d, splats.conics, splats.colors, splats.opacities, splats.depths)
         columns = (ScreenRecord.MEAN, ScreenRecord.CONIC, ScreenRecord.COLOR, ScreenRecord.OPACITY, ScreenRecord.DEPTH)
@@ -104,7 +95,6 @@ class ReferenceRendered(Rendered):
     """One forward pass (see `Rendered`)."""
 
     _sums: Tensor = field(repr=False)
-    _table: Tensor = field(repr=False)
     _compositor: Compositor = field(repr=False)
     _rows: Rows = field(repr=False)
     _splats: Splats = field(repr=False)
@@ -133,12 +123,8 @@ class ReferenceRendered(Rendered):
             to_alpha = to_alpha - given["color_gradients"].to(self._background) @ self._background
         columns = [given["color_gradients"], to_alpha[:, None], divided[:, None]]
         gradients = torch.cat(columns, dim=1).to(self._sums.dtype)
-        records = compositing.composite_backward(
-            self._compositor, self._table, self._sums, gradients, given["pixel_errors"]
-        )
-        return ReferenceScreenGradients(
-            self._rows, self._splats, self._leaves, records, self._compositor.samples, with_statistics
-        )
+        records = self._compositor.backward(self._sums, gradients, given["pixel_errors"])
+        return ReferenceScreenGradients(self._rows, self._splats, self._leaves, records, self._compositor.samples)
 
 
 def rasterize_reference(
@@ -149,15 +135,15 @@ def rasterize_reference(
     stay = kept(options.dropout, len(gaussians), gaussians.device)
     rows, leaves, splats = _projected(gaussians, cameras, options, None if stay is None else stay[:, None])
     with torch.no_grad():
-        compositor = Compositor(intersect_tiles(rows, splats, samples, settings), samples, settings)
-        table = compositing.splat_table(splats.means2d, splats.conics, splats.colors, splats.opacities, splats.depths)
-        sums = compositing.composite(compositor, table)
+        table = splat_table(splats)
+        compositor = Compositor(intersect_tiles(rows, splats, samples, settings), samples, settings, table)
+        sums = compositor.forward()
         depths = sums[:, 4] / sums[:, 3].clamp(min=ALPHA_TINY) if options.with_depth else None
         colors, background = sums[:, :3], None
         if any(options.background):
             background = sums.new_tensor(options.background)
             colors = colors + (1.0 - sums[:, 3:4]) * background
-    return ReferenceRendered(colors, sums[:, 3], depths, sums, table, compositor, rows, splats, leaves, background)
+    return ReferenceRendered(colors, sums[:, 3], depths, sums, compositor, rows, splats, leaves, background)
 
 
 def kept(dropout: Dropout, count: int, device: torch.device) -> Tensor | None:
@@ -177,7 +163,7 @@ def screen_gradients(
     """`Engine.screen_gradients`: projects those Gaussians again that were drawn."""
     rows, leaves, splats = _projected(gaussians, cameras, options, (plain.radii > 0).any(dim=-1).T)
     records = plain.records.flatten(0, 1)[rows.flat]  # [R, 16]
-    return ReferenceScreenGradients(rows, splats, leaves, records, samples, plain.with_statistics)
+    return ReferenceScreenGradients(rows, splats, leaves, records, samples)
 
 
 def _projected(

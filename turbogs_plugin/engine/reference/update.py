@@ -7,7 +7,6 @@ keeps its parameters, moments and step count. So does one with a gradient that i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -51,12 +50,12 @@ def apply_update(
     gradient = rows.sum(dim=0).clamp(-SUM_LIMIT, SUM_LIMIT)
     terms = advance(moments.exp_avg, moments.exp_avg_sq, gradient, index, steps, rule)
     if rule.lm is None:
-        delta = terms.delta(packed_rates(rule.rates, gradient))
+        delta = adam_step(packed_rates(rule.rates, gradient), *terms)
     else:
         if not rule.per_view:
             rows, losses = gradient[None], losses.sum(dim=0, keepdim=True)
         if rule.lm.units == "balanced":
-            delta = balanced_delta(rows, losses, terms, rule.rates, rule.lm)
+            delta = balanced_delta(rows, losses, *terms, rule.rates, rule.lm)
         else:
             # The printed equation: the g_k are the rows of J, and m and v have no bias correction.
             damping = torch.sqrt(moments.exp_avg_sq[index]) + rule.eps
@@ -64,7 +63,7 @@ def apply_update(
     gradient = clipped(gradients.shN[index].flatten(1))
     terms = advance(moments.exp_avg_shN, moments.exp_avg_sq_shN, gradient, index, steps, rule)
     changes = {name: delta[:, place] for name, place in COLUMNS.items()}
-    for name, change in {**changes, "shN": terms.delta(rule.rates.shN)}.items():
+    for name, change in {**changes, "shN": adam_step(rule.rates.shN, *terms)}.items():
         value = getattr(gaussians, name)
         value.index_add_(0, index, change.reshape(len(index), *value.shape[1:]))
 
@@ -89,22 +88,13 @@ def finite_gradients(gradients: GaussianGradients) -> Tensor:
     return finite
 
 
-@dataclass
-class AdamTerms:
-    """The terms of an update of n Gaussians, [n, D] each: bias-corrected m; sqrt(v) + eps, v bias-corrected."""
-
-    mean: Tensor
-    denominator: Tensor
-
-    def delta(self, rates: Tensor | float) -> Tensor:
-        """[n, D] the change of the parameters by Adam."""
-        return -(rates * (self.mean / self.denominator))
-
-
 def advance(
     exp_avg: Tensor, exp_avg_sq: Tensor, gradient: Tensor, index: Tensor, steps: Tensor, rule: UpdateRule
-) -> AdamTerms:
+) -> tuple[Tensor, Tensor]:
     """Advance the moments of the Gaussians `index` [n] by their gradients [n, D]. `steps`: [n], this one included.
+
+    Returns:
+        Bias-corrected m; sqrt(v) + eps, v bias-corrected: [n, D] each.
 
     1 - beta is computed in double, and the bias correction 1 - beta^t as -expm1(t log beta): in float32 either
     difference would have a relative error of 5e-5 for beta = 0.999.
@@ -115,11 +105,16 @@ def advance(
     count = steps.to(gradient.dtype).unsqueeze(-1)  # [n, 1]
     mean_correction = -torch.expm1(count * math.log(rule.beta1)) if rule.beta1 > 0 else 1.0
     square_correction = -torch.expm1(count * math.log(rule.beta2)) if rule.beta2 > 0 else 1.0
-    return AdamTerms(mean / mean_correction, torch.sqrt(square / square_correction) + rule.eps)
+    return mean / mean_correction, torch.sqrt(square / square_correction) + rule.eps
+
+
+def adam_step(rates: Tensor | float, mean: Tensor, denominator: Tensor) -> Tensor:
+    """[n, D] the change of the parameters by Adam, from the results of `advance`."""
+    return -(rates * (mean / denominator))
 
 
 def balanced_delta(
-    rows: Tensor, losses: Tensor, terms: AdamTerms, parameter_rates: ParameterRates, lm: MomentLMParams
+    rows: Tensor, losses: Tensor, mean: Tensor, denominator: Tensor, parameter_rates: ParameterRates, lm: MomentLMParams
 ) -> Tensor:
     """[n, 14] change of the parameters by the unit-consistent form.
 
@@ -127,16 +122,16 @@ def balanced_delta(
         rows: [K, n, 14] gradients of each view.
         losses: [K, n] the Gaussian's share of the loss in each view. A row whose share is zero or not finite is left
             out, as it says nothing about curvature.
-        terms: from the bias-corrected moments, [n, 14].
+        mean, denominator: [n, 14], from `advance`.
     """
     rates = packed_rates(parameter_rates, rows)
-    adam = terms.delta(rates)
+    adam = adam_step(rates, mean, denominator)
     has_share = (losses > 0) & torch.isfinite(losses)
     largest = torch.finfo(rows.dtype).max
     weights = torch.where(has_share, (lm.curvature / losses).clamp(max=largest), 0.0).to(rows.dtype)
     # A rate of zero fixes its parameter, even against coupling: its damping divides by the root of the smallest float.
-    damping = terms.denominator / rates.clamp(min=torch.finfo(rows.dtype).tiny ** 0.5)
-    delta = _solve(rows, weights, damping, terms.mean)
+    damping = denominator / rates.clamp(min=torch.finfo(rows.dtype).tiny ** 0.5)
+    delta = _solve(rows, weights, damping, mean)
     if lm.max_step > 0:
         bound = torch.maximum(lm.max_step * rates, adam.abs())
         delta = torch.maximum(torch.minimum(delta, bound), -bound)

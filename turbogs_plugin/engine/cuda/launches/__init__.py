@@ -19,51 +19,53 @@ from typing import TYPE_CHECKING, Any
 from .base import LAUNCHES, Launch, field_types, fields_of, nested_type
 
 if TYPE_CHECKING:
+    from types import SimpleNamespace as Copies
+    from types import SimpleNamespace as TileScratch
+
     from torch import Tensor
 
-    from turbogs_plugin.engine.exposures import Exposures as ExposureArrays
-    from turbogs_plugin.engine.moments import GaussianMoments as Moments
+    from turbogs_plugin.engine.moments import GaussianMoments
     from turbogs_plugin.engine.render_pass import RasterSettings as BlendSettings
     from turbogs_plugin.engine.render_pass import RasterSettings as ProjectionSettings
     from turbogs_plugin.engine.render_pass import Upstream
-    from turbogs_plugin.engine.rules import Dropout as DropoutWords
-    from turbogs_plugin.engine.rules import LossTerms as LossSettings
-    from turbogs_plugin.engine.rules import ParameterRates as Rates
-    from turbogs_plugin.error_maps import ErrorMaps as MapArrays
-    from turbogs_plugin.masks import PixelMasks as MaskArrays
-    from turbogs_plugin.types import Gaussians as GaussianArrays
-    from turbogs_plugin.types import GaussianStats as StatSums
-    from turbogs_plugin.types import PixelSamples as SampleArrays
+    from turbogs_plugin.engine.rules import Dropout, LossTerms, ParameterRates
+    from turbogs_plugin.error_maps import ErrorMaps
+    from turbogs_plugin.masks import PixelMasks
+    from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamples
 else:  # the fields that launches read of these
-    GaussianArrays = fields_of(Tensor="means quats scales opacities sh0 shN")  # quats and shN 16-byte aligned
-    StatSums = fields_of(  # [N] float32 each
+    Gaussians = fields_of(Tensor="means quats scales opacities sh0 shN")  # quats and shN 16-byte aligned
+    GaussianStats = fields_of(  # [N] float32 each
         Tensor="error_sums distance_sums weight_sums grad_sums absgrad_sums square_sums view_counts max_radii"
     )
-    SampleArrays = fields_of(Tensor="pixel_ids tile_ids tile_offsets weights")  # int32; weights float32 or None
+    PixelSamples = fields_of(Tensor="pixel_ids tile_ids tile_offsets weights")  # int32; weights float32 or None
     ProjectionSettings = fields_of(float="near_plane far_plane alpha_min")
     BlendSettings = fields_of(float="alpha_min alpha_max transmittance_min")
-    DropoutWords = fields_of(int="threshold seed iteration")
+    Dropout = fields_of(int="threshold seed iteration")
     Upstream = fields_of(Tensor="color_gradients alpha_gradients depth_gradients pixel_errors")
-    Moments = fields_of(Tensor="exp_avg exp_avg_sq exp_avg_shN exp_avg_sq_shN steps skipped")
-    Rates = fields_of(float="means quats scales opacities sh0 shN")
-    MaskArrays = fields_of(Tensor="tiles rows bits")  # [L] int32, [L] int32, [B, 8] int32
-    LossSettings = fields_of(float="epsilon l1_weight structure_weight variance_constant", bool="balance")
-    MapArrays = fields_of(Tensor="errors stamps view_sums")  # [X] float16, [X] int16, [V] float64
-    ExposureArrays = fields_of(Tensor="offsets exp_avg exp_avg_sq steps")
+    GaussianMoments = fields_of(Tensor="exp_avg exp_avg_sq exp_avg_shN exp_avg_sq_shN steps skipped")
+    TileScratch = fields_of(Tensor="tile_errors tile_ages tile_keys tile_missed")  # by tile of the batch
+    Copies = fields_of(int="copy_0 copy_1 copy_2 copy_3 copy_4 copy_5 copy_6")
+    ParameterRates = fields_of(float="means quats scales opacities sh0 shN")
+    PixelMasks = fields_of(Tensor="tiles rows bits")  # [L] int32, [L] int32, [B, 8] int32
+    LossTerms = fields_of(float="epsilon l1_weight structure_weight variance_constant", bool="balance")
+    LossOutput = fields_of(Tensor="loss color_gradients pixel_errors")
+    ErrorMaps = fields_of(Tensor="errors stamps view_sums")  # [X] float16, [X] int16, [V] float64
 
 __all__ = ["LAUNCHES", "Launch", "field_types", "nested_type"]
 
-NO_STATS: Any = SimpleNamespace(**dict.fromkeys(StatSums.__annotations__))
-NO_MASKS: Any = SimpleNamespace(**dict.fromkeys(MaskArrays.__annotations__))
-NO_MAPS: Any = SimpleNamespace(**dict.fromkeys(MapArrays.__annotations__))
-"""Arguments of a launch that adds to no statistics, counts every pixel, updates no maps."""
+NO_COPIES: Any = SimpleNamespace(**dict.fromkeys(Copies.__annotations__, 0))
+NO_STATS: Any = SimpleNamespace(**dict.fromkeys(GaussianStats.__annotations__))
+NO_MASKS: Any = SimpleNamespace(**dict.fromkeys(PixelMasks.__annotations__))
+NO_SCRATCH: Any = SimpleNamespace(**dict.fromkeys(TileScratch.__annotations__))
+NO_MAPS: Any = SimpleNamespace(**dict.fromkeys(ErrorMaps.__annotations__))
+"""Arguments of a launch without copies, statistics, masks, tiles to draw, or maps."""
 
 
 @dataclass
 class Scene:
     """The Gaussians and the views of a batch."""
 
-    gaussians: GaussianArrays
+    gaussians: Gaussians
     viewmats: Tensor  # [C, 4, 4] float32, the capture's cameras, or the views' alone
     Ks: Tensor  # [C, 3, 3] float32
     images: list[int]  # [K] layout.ImageRow
@@ -106,7 +108,7 @@ class ScreenBackward:
     scene: Scene
     records: Tensor  # [K, N, 16] float32, layout.ScreenRecord; anything where off screen
     radii: Tensor  # [K, N, 2] int32
-    stats: StatSums  # the launch adds to them
+    stats: GaussianStats  # the launch adds to them
     num_filled: Tensor | None  # [1] int32; None where all slots are filled
     num_slots: int  # P
     overflow: Tensor | None  # [1] int32; if not 0, the launch does nothing
@@ -119,7 +121,7 @@ class RasterProject(Launch):
     scene: Scene
     grid: GridOrigin
     settings: ProjectionSettings
-    dropout: DropoutWords
+    dropout: Dropout
     splats: Splats
     tile_ids: Tensor | None  # [T] int32; None where all tiles have samples
     tile_cursors: Tensor  # [T + 1] int32
@@ -214,32 +216,16 @@ class ProjectionBackward(Launch):
 
 
 @dataclass
-class Copies:
-    """How many bytes behind each parameter a copy of it lies, maybe in another GPU's memory; 0: no copy."""
-
-    copy_0: int
-    copy_1: int
-    copy_2: int
-    copy_3: int
-    copy_4: int
-    copy_5: int
-    copy_6: int
-
-
-NO_COPIES = Copies(*(0,) * 7)
-
-
-@dataclass
 class FusedStep(Launch):
     """Projection backward and one step of the optimizer, in place on Gaussians and moments, and on copies of the
     Gaussians."""
 
     screen: ScreenBackward
-    copies: Copies
-    moments: Moments
+    copies: Copies  # bytes from each parameter to a copy of it, maybe in another GPU's memory; 0: no copy
+    moments: GaussianMoments
     kind: int  # of layout.UPDATE_KINDS
     rows_per_view: bool
-    rates: Rates
+    rates: ParameterRates
     beta1: float
     beta2: float
     eps: float
@@ -248,40 +234,23 @@ class FusedStep(Launch):
 
 
 @dataclass
-class TileScratch:
-    """Scratch for unit = tile: an entry for each tile of the batch."""
-
-    tile_errors: Tensor | None  # float64
-    tile_ages: Tensor | None  # int32
-    tile_keys: Tensor | None  # int64
-    tile_missed: Tensor | None  # float32
-
-
-NO_SCRATCH = TileScratch(None, None, None, None)
-"""Scratch of a draw of single pixels: none."""
-
-
-@dataclass
 class SamplePixels(Launch):
-    """Draw samples: writes `pixel_ids`, `tile_ids`, `tile_offsets` and `weights`."""
+    """Draw samples: writes the tensors of `samples`."""
 
     errors: Tensor  # [X] float16
     stamps: Tensor  # [X] int16
     views: list[int]  # [K] layout.DrawRow
     grid: GridOrigin
     unit: int  # of layout.SAMPLE_UNITS
-    masks: MaskArrays
+    masks: PixelMasks
     slots_per_tile: int  # slots of a tile that the image's edge does not cut; with masks, of every tile
     mixed_uniform: bool
     importance: float
     seed: int
     iteration: int
     now: int  # a stamp's age is `now` less the stamp
-    pixel_ids: Tensor  # [P] int32
-    tile_ids: Tensor  # [T] int32
-    tile_offsets: Tensor  # [T + 1] int32
-    weights: Tensor | None  # [P] float32; None without importance
-    scratch: TileScratch
+    samples: PixelSamples  # weights are None without importance
+    scratch: TileScratch  # float64, int32, int64 and float32; None for unit = pixel
 
 
 @dataclass
@@ -291,64 +260,19 @@ class SparseLoss(Launch):
     colors: Tensor  # [P, 3] float32
     targets: Tensor | None  # [P, 3] float32
     photos: Tensor | None  # [X, 3 or 4] uint8, from which to gather the colours; instead of `targets`
-    samples: SampleArrays
+    samples: PixelSamples
     views: list[int]  # [K] layout.ViewRow
     grid: GridOrigin
     structure: int  # of layout.STRUCTURES
-    terms: LossSettings
-    maps: MapArrays
+    terms: LossTerms
+    maps: ErrorMaps
     beta: float  # EMA weight of a new error
     stamp: int  # for the pixels visited
     num_filled: Tensor | None  # [1] int32; None where all slots are filled
-    loss: Tensor  # [] float64, zero
-    color_gradients: Tensor  # [P, 3] float32
-    pixel_errors: Tensor  # [P] float32
+    output: LossOutput  # the loss is [] float64, zero
     nonfinite_losses: Tensor | None  # [] int64, 1 is added if the loss is not finite
     overflow: Tensor | None  # [1] int32; if not 0, the maps stay as they are
     background: Background  # shows through photos with an alpha
-
-
-@dataclass
-class ExposedViews:
-    """Rendered colours, and the exposures of their photos."""
-
-    colors: Tensor  # [P, 3] float32
-    tile_ids: Tensor  # [T] int32
-    tile_offsets: Tensor  # [T + 1] int32
-    views: list[int]  # [K] layout.ViewRow
-    grid: GridOrigin
-    offsets: Tensor  # [V, 3, 4] float32
-
-
-@dataclass
-class ExposeColors(ExposedViews, Launch):
-    """Map the colours by the exposures: writes `exposed`."""
-
-    exposed: Tensor  # [P, 3] float32
-
-
-@dataclass
-class ExposureBackward(ExposedViews, Launch):
-    """Gradients through `ExposeColors`: changes `gradients` in place, adds to `sums`."""
-
-    gradients: Tensor  # [P, 3] float32
-    sums: Tensor  # [K, 3, 4] float64, zero
-
-
-@dataclass
-class ExposureStep(Launch):
-    """One step of Adam for the photos of a batch, in place; then the mean of all offsets is zero."""
-
-    sums: Tensor  # [K, 3, 4] float64
-    views: list[int]  # [K] layout.ViewRow
-    grid: GridOrigin
-    exposures: ExposureArrays
-    overflow: Tensor | None  # [1] int32; if not 0, the launch does nothing
-    rate: float
-    beta1: float
-    beta2: float
-    eps: float
-    pull: float
 
 
 @dataclass
