@@ -10,7 +10,7 @@ from helpers.tracked import HEIGHT, WIDTH, tracked, write_tracked
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.bundle_adjustment import reprojection_errors
-from turbogs_plugin.captures.camera_refinement import _pinholes, load_and_find, refine_cameras
+from turbogs_plugin.captures.camera_refinement import _pinholes, find_cameras, refine_cameras
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed.ranks import Ranks
 from turbogs_plugin.engine.render_pass import RasterSettings
@@ -92,7 +92,7 @@ def test_of_several_processes_the_first_one_refines_for_all(capture):
 
         def agree(self, value):
             assert value is None
-            return load_and_find(capture)[1]
+            return find_cameras(load_scene(capture))
 
     second = open_scene(load_config("turbogs", [f"scene.path={capture}"]), ranks=Second())
     assert unchanged(first, second, "train") and second.points.equal(first.points)

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from threading import Lock
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture
-from turbogs_plugin.captures.decoding import channels_of, load_photos, photo_array, photo_sizes, reduced_sizes
+from turbogs_plugin.captures.decoding import channels_of, load_photos, photo_sizes, reduced_sizes
 from turbogs_plugin.captures.kinds import read_capture
 from turbogs_plugin.captures.mask_files import find_masks, load_masks
 from turbogs_plugin.captures.photo_files import IMAGES
@@ -27,7 +24,8 @@ from turbogs_plugin.masks import PixelMasks, ViewMask
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.geometry import camera_centers
 from turbogs_plugin.scene.host_arrays import file_note
-from turbogs_plugin.scene.scene import PosedImages, PosedViews, Scene
+from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.scene.scene import PosedImages, Scene
 from turbogs_plugin.types import Cameras
 
 MOST_PIXELS = 1 << 28
@@ -59,7 +57,6 @@ def load_scene(
     factor: int = 1,
     test_every: int = 8,
     progress: Callable[[int, int], object] | None = None,
-    meanwhile: Callable[[PosedViews, PosedViews, Tensor], object] | None = None,
 ) -> Scene:
     """Load a capture with its photos.
 
@@ -75,8 +72,7 @@ def load_scene(
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
             Captures with a split of their own (NeRF-synthetic, lists in a ``transforms.json``) keep it.
-        progress: called with the number of photos decoded so far, and of all, by one thread at a time.
-        meanwhile: called once, while photos are decoded, with training views, test views and the scene's points.
+        progress: called with the number of photos decoded so far, and of all.
 
     Raises:
         InputError: anything wrong with the scene or the arguments, in one line.
@@ -93,26 +89,16 @@ def load_scene(
     mask_files, mask_note = find_masks(scene, capture, files.paths)
     masks = load_masks(mask_files, files.paths, capture, files.file_sizes, files.sizes)
     seen = np.array([mask is None or mask.pixels > 0 for mask in masks])
-    for name, part in (("training", ~test), ("test", test)):
-        if not (part & seen).any():
+    parts = [np.flatnonzero(part & seen) for part in (~test, test)]
+    for name, part, views in zip(("training", "test"), (~test, test), parts, strict=True):
+        if not len(views):
             raise InputError(
                 f"{scene}: all {part.sum()} {name} photos are masked whole: zero in a mask, or in "
                 "the alpha of a photo, is masked; mend the masks, or take them away"
             )
-    parts = [np.flatnonzero(part & seen) for part in (~test, test)]
-    posed = [_posed(capture, viewmats, files.sizes, views) for views in parts]
-    colors = [_room(capture, files, views) for views in parts]  # before minutes go into photos that have none
-    counter, one_at_a_time = itertools.count(1), Lock()
-
-    def loaded() -> None:
-        with one_at_a_time:
-            if progress is not None:
-                progress(next(counter), int(seen.sum()))
-
-    works = (None if meanwhile is None else partial(meanwhile, posed[0], posed[1], points), None)
     train, tested = (
-        _load_views(capture, files, views, masks, posed_views, room, loaded, work)
-        for views, posed_views, room, work in zip(parts, posed, colors, works, strict=True)
+        _posed(capture, viewmats, files.sizes, masks, views, photos)
+        for views, photos in zip(parts, _load_parts(capture, files, parts, progress), strict=True)
     )
     if capture.point_colors is None:
         point_colors = colors_in_photos(points, train.cameras, train.photos, train.masks)
@@ -137,6 +123,43 @@ def load_scene(
         drawn_points=capture.point_colors is None,
         notes=tuple(filter(None, (*capture.notes, *notes))),
     )
+
+
+def _load_parts(
+    capture: Capture, files: PhotoFiles, parts: list[np.ndarray], progress: Callable[[int, int], object] | None
+) -> list[Photos]:
+    """The photos of the training views and of the test views, `parts`, in one array: its room is found at once."""
+    views = np.concatenate(parts)
+    paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
+    channels = channels_of(paths) if capture.alpha == "opacity" else 3
+    photos = load_photos(paths, files.file_sizes[views], files.sizes[views], lenses, channels, progress)
+    count = len(parts[0])
+    first = int(photos.offsets[count])
+    return [
+        Photos(photos.colors[:first], photos.sizes[:count]),
+        Photos(photos.colors[first:], photos.sizes[count:]),
+    ]
+
+
+def _posed(
+    capture: Capture,
+    viewmats: Tensor,
+    sizes: np.ndarray,
+    masks: list[ViewMask | None],
+    views: np.ndarray,
+    photos: Photos,
+) -> PosedImages:
+    """Some views with their photos, cameras for photos of these `sizes` [V, 2], masks and what the photos show."""
+    ratios = sizes / capture.sizes  # [V, 2]
+    intrinsics = capture.Ks.copy()
+    intrinsics[:, :2] *= ratios[:, :, None]
+    cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
+    shown = None if capture.observations is None else capture.observations.of_views(views, ratios[views])
+    own, masked = [masks[view] for view in views], None
+    if any(mask is not None for mask in own):
+        pairs = zip(own, sizes[views].tolist(), strict=True)
+        masked = PixelMasks.of_views([ViewMask.whole(tuple(size)) if mask is None else mask for mask, size in pairs])
+    return PosedImages(cameras, tuple(capture.names[view] for view in views), photos, masked, shown)
 
 
 def _test_views(scene: Path, capture: Capture, test_every: int) -> np.ndarray:
@@ -164,42 +187,6 @@ def _normalised(scene: Path, capture: Capture, test: np.ndarray) -> tuple[Frame,
             f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32: take them out"
         )
     return frame, viewmats, points
-
-
-def _posed(capture: Capture, viewmats: Tensor, sizes: np.ndarray, views: np.ndarray) -> PosedViews:
-    """Some views' cameras for photos of these `sizes` [V, 2], and what the photos show."""
-    ratios = sizes / capture.sizes  # [V, 2]
-    intrinsics = capture.Ks.copy()
-    intrinsics[:, :2] *= ratios[:, :, None]
-    cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
-    shown = None if capture.observations is None else capture.observations.of_views(views, ratios[views])
-    return PosedViews(cameras, shown)
-
-
-def _room(capture: Capture, files: PhotoFiles, views: np.ndarray) -> Tensor:
-    """Room for the photos of some views, with alpha where that is opacity."""
-    channels = channels_of([files.paths[view] for view in views]) if capture.alpha == "opacity" else 3
-    return photo_array(files.sizes[views], channels)
-
-
-def _load_views(
-    capture: Capture,
-    files: PhotoFiles,
-    views: np.ndarray,
-    masks: list[ViewMask | None],
-    posed: PosedViews,
-    colors: Tensor,
-    loaded: Callable[[], object],
-    meanwhile: Callable[[], object] | None,
-) -> PosedImages:
-    """Some views with their photos, decoded into `colors`; the last two arguments are for `load_photos`."""
-    paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
-    sizes, own, masked = files.sizes[views], [masks[view] for view in views], None
-    photos = load_photos(paths, files.file_sizes[views], sizes, lenses, colors, loaded, meanwhile)
-    if any(mask is not None for mask in own):
-        pairs = zip(own, sizes.tolist(), strict=True)
-        masked = PixelMasks.of_views([ViewMask.whole(tuple(size)) if mask is None else mask for mask, size in pairs])
-    return PosedImages(posed.cameras, tuple(capture.names[v] for v in views), photos, masked, posed.observations)
 
 
 def _masked_note(names: tuple[str, ...], masks: list[ViewMask | None], sizes: np.ndarray, seen: np.ndarray) -> str:
