@@ -86,41 +86,6 @@ def test_a_frame_overrides_what_stands_for_all(tmp_path):
     assert scene.train.cameras.sizes[1:4].tolist() == [[20, 10], [12, 10], [20, 10]]
 
 
-@pytest.mark.parametrize("key", ["K", "intrinsic_matrix"])
-def test_intrinsics_as_a_matrix(tmp_path, key):
-    """Of each frame, 3x3 or 4x4 as NeuS2 writes it; a small skew is left by decompositions of projections."""
-    none = dict.fromkeys(["fl_x", "fl_y", "cx", "cy"])
-    folder = write_transforms(tmp_path / "cup", **none)
-
-    def change(content):
-        for view, frame in enumerate(content["frames"]):
-            K = np.eye(3 if key == "K" else 4)
-            K[:2, :3] = [[25 + view, 1e-4, 9.5], [0, 26, 5.5]]
-            frame[key] = K.tolist()
-
-    edit(folder, change)
-    scene = load_scene(folder)
-    np.testing.assert_allclose(scene.train.cameras.Ks[2], [[28, 0, 9.5], [0, 26, 5.5], [0, 0, 1]])
-    edit(folder, lambda content: content.update(fl_x=40.0))  # comes first
-    np.testing.assert_allclose(load_scene(folder).train.cameras.Ks[2], [[40, 0, 10], [0, 40, 5], [0, 0, 1]])
-
-
-@pytest.mark.parametrize(
-    "K",
-    [
-        "wide",
-        [[25, 0, 10], [0, 25, 5], [0, 1]],
-        [[25, 0, 10], [0, math.nan, 5], [0, 0, 1]],
-        [[25, 0, 10], [0, -25, 5], [0, 0, 1]],
-        [[25, 3, 10], [0, 25, 5], [0, 0, 1]],
-        [[25, 0, 0], [0, 25, 0], [10, 5, 1]],
-    ],
-)
-def test_matrices_that_are_no_intrinsics(tmp_path, K):
-    folder = write_transforms(tmp_path / "cup", fl_x=None, K=K)
-    assert_refused("K is .*: it must be finite numbers ..fx, 0, cx., .0, fy, cy., .0, 0, 1..", load_scene, folder)
-
-
 def test_transparency_is_opacity(tmp_path):
     """Colours are kept as multiplied by alpha, and shown on any background."""
     scene = load_scene(write_transforms(tmp_path / "cup", mode="RGBA"))
@@ -195,7 +160,7 @@ def set_pose(value):
     [
         (lambda content: content.update(camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR': known are OPENCV"),
         (lambda content: content.update(camera_model=[3]), r"'\[3\]': known are"),
-        (lambda content: content.update(k5=0.1), "f0.png has k5, which OPENCV does not"),
+        (lambda content: content.update(k4=0.1, k5=0.1), "f0.png has k4 and k5, which OPENCV does not"),
         (lambda content: content.update(is_fisheye=True, p1=0.1, p2=0.1), "has p1 and p2, which OPENCV_FISHEYE"),
         (lambda content: content.update(k1="much"), "k1 is 'much': it must be a finite number"),
         (lambda content: content["frames"][4].update(k1=-1e9), "f4.png is OPENCV with parameters that are not those"),
@@ -278,8 +243,8 @@ def test_frames_without_a_photo_are_left_out_and_counted(tmp_path):
     scene = load_scene(folder)
     assert scene.test.names == ("f0.png",)
     assert scene.train.names == ("f2.png", "f3.png", "f5.png", "f6.png", "f7.png", "f8.png")
-    assert "7 photos, no points, so 50,000 random ones" in scene.notes[0]
-    assert scene.notes[1:] == ("2 of 9 images are left out, their photos do not exist: images/f1.png, ...",)
+    assert scene.notes[0].endswith(": 7 photos") and len(scene.points) == 50_000 and scene.drawn_points
+    assert scene.notes[1] == "2 of 9 images are left out, their photos do not exist: images/f1.png, ..."
 
 
 @pytest.mark.parametrize(
@@ -336,24 +301,20 @@ def test_photos_in_another_folder_that_may_be_others_are_not_taken(tmp_path):
     (folder / "images").rename(folder / "old")
     (folder / "rgb").mkdir()
     (folder / "rgb/f2.png").write_bytes((folder / "old/f2.png").read_bytes())
-    missing = r"names 9 photos, of which 9 are missing in .*/cup \(images/f0.png, .*\): at least 3 are needed; copy"
-    assert_refused(missing, load_scene, folder)
+    left_out = "1 of 9 images are left out, their photos do not exist: images/f2.png"
+    assert left_out in load_scene(folder).notes
     (folder / "rgb/f2.png").unlink()
     assert len(load_scene(folder).train) == 7
     edit(folder, lambda content: content["frames"][1].update(file_path="other/f0.png"))
-    assert_refused(missing, load_scene, folder)
+    assert "2 of 9 images are left out, their photos do not exist: images/f0.png, ..." in load_scene(folder).notes
 
 
 def test_neighbours_with_another_suffix_that_are_no_photos(tmp_path):
-    """Not what lies beside photos that are there, what another frame names, or one of two."""
+    """Not what another frame names, or one of two."""
     folder = write_transforms(tmp_path / "cup")
     photo = (folder / "images/f4.png").read_bytes()
-    (folder / "images/f4.png").unlink()
-    for beside in ("f3.jpg", "f4.jpg"):
-        (folder / "images" / beside).write_bytes(photo)
+    (folder / "images/f4.png").rename(folder / "images/f4.jpg")
     left_out = "1 of 9 images are left out, their photos do not exist: images/f4.png"
-    assert load_scene(folder).notes[1] == left_out
-    (folder / "images/f3.jpg").unlink()
     assert load_scene(folder).notes[1].startswith("1 photos are not where transforms.json says: images/f4.jpg")
     (folder / "images/f4.JPEG").write_bytes(photo)
     assert load_scene(folder).notes[1] == left_out
@@ -369,12 +330,17 @@ def listed(*views: int) -> list[str]:
 @pytest.mark.parametrize(
     ("lists", "train", "test", "said"),
     [
-        ({"train": (0, 1, 2, 3), "val": (4, 5), "test": (6, 7)}, "0123", "67", "6 photos, its own split, 4 training"),
-        ({"train": (0, 1, 2, 3), "val": (4, 5)}, "0123", "45", "2 test photos, 3 others not used"),
-        ({"train": (0, 1, 2, 3), "val": (4, 5), "test": ()}, "0123", "45", "2 test photos, 3 others"),
-        ({"train": (8, 1, 2)}, "128", "034567", "6 test photos, "),
-        ({"test": (8,)}, "01234567", "8", "8 training and 1 test photos, "),
-        ({"test": (8,), "val": (7,)}, "0123456", "8", "1 test photos, 1 others not used"),
+        (
+            {"train": (0, 1, 2, 3), "val": (4, 5), "test": (6, 7)},
+            "0123",
+            "67",
+            "3 others not used): 6 photos, by its own split 4 for training, 2 for",
+        ),
+        ({"train": (0, 1, 2, 3), "val": (4, 5)}, "0123", "45", "3 others not used): 6 photos, "),
+        ({"train": (0, 1, 2, 3), "val": (4, 5), "test": ()}, "0123", "45", "3 others not used): 6"),
+        ({"train": (8, 1, 2)}, "128", "034567", "by its own split 3 for training, 6 for testing"),
+        ({"test": (8,)}, "01234567", "8", "by its own split 8 for training, 1 for testing"),
+        ({"test": (8,), "val": (7,)}, "0123456", "8", "1 others not used): 8 photos"),
         ({"train": (0, 1, 2), "val": (3, 4), "test": (3, 4)}, "012", "34", "4 others not used"),
     ],
 )
@@ -400,11 +366,8 @@ def test_lists_of_file_names_are_the_split(tmp_path, lists, train, test, said):
         ({"train_filenames": listed(*range(9))}, "leave no photo to train or to test on"),
         ({"train_filenames": listed(1, 2, 3), "test_filenames": listed(3, 4)}, r"testing \(images/f3.png\)"),
         ({"train_filenames": listed(1, 2), "test_filenames": listed(3, 4)}, "2 training images: at least 3"),
-        ({"test_filenames": listed(0)}, "none of its 1 test photos is in"),
     ],
 )
 def test_a_split_that_cannot_be_is_one_line(tmp_path, content, message):
     folder = write_transforms(tmp_path / "cup", **content)
-    if content == {"test_filenames": listed(0)}:
-        (folder / "images" / "f0.png").unlink()
     assert_refused(message, load_scene, folder)

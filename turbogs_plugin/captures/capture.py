@@ -33,7 +33,7 @@ class Capture:
         viewmats: [V, 4, 4] float64, world to camera (x right, y down, z forward).
         Ks: [V, 3, 3] float64, intrinsics of the full-size photos, undistorted where they have a lens.
         sizes: [V, 2] int64 (width, height) of the full-size photos, undistorted where they have a lens.
-        points: [M, 3] float64.
+        points: [M, 3] float64; M is 0 where `load_scene` is to draw them.
         point_colors: [M, 3] uint8; None: the points were drawn at random, and their colours are taken from the photos
             (`colors_in_photos`).
         lenses: one a view, None for a pinhole camera; given as empty where all are.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from turbogs_plugin.captures.decoding import channels_of, load_photos, photo_siz
 from turbogs_plugin.captures.kinds import read_capture
 from turbogs_plugin.captures.mask_files import find_masks, load_masks
 from turbogs_plugin.captures.photo_files import IMAGES
-from turbogs_plugin.captures.starting_points import colors_in_photos
+from turbogs_plugin.captures.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.captures.undistort import undistortion_note
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks, ViewMask
@@ -82,7 +82,7 @@ def load_scene(
         if not isinstance(number, int) or number < 1:
             raise InputError(f"{name} is {number}: it must be an integer of at least 1")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
-        capture = read_capture(scene)
+        capture = _with_points(read_capture(scene))
     test = _test_views(scene, capture, test_every)
     frame, viewmats, points = _normalised(scene, capture, test)
     files = _find_photos(scene, capture, factor)
@@ -160,6 +160,16 @@ def _posed(
         pairs = zip(own, sizes[views].tolist(), strict=True)
         masked = PixelMasks.of_views([ViewMask.whole(tuple(size)) if mask is None else mask for mask, size in pairs])
     return PosedImages(cameras, tuple(capture.names[view] for view in views), photos, masked, shown)
+
+
+def _with_points(capture: Capture) -> Capture:
+    """The capture, with points drawn about what its training cameras look at where it has none."""
+    if len(capture.points):
+        return capture
+    train = slice(None) if capture.test is None or capture.test.all() else ~capture.test
+    points, how = starting_points(capture.viewmats[train], capture.Ks[train], capture.sizes[train])
+    note = f"{len(points):,} random points are drawn {how}, as the capture has none"
+    return replace(capture, points=points, point_colors=None, notes=(*capture.notes, note))
 
 
 def _test_views(scene: Path, capture: Capture, test_every: int) -> np.ndarray:

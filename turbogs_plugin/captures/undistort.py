@@ -8,9 +8,9 @@ middle until it does not. The map from the pinhole's image to the photo is kept 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,10 +22,8 @@ from turbogs_plugin.errors import InputError
 if TYPE_CHECKING:
     import pycolmap
 
-Projection = Callable[[np.ndarray], np.ndarray]
-"""[N, 2] float64 points at depth 1 before the camera -> [N, 2] pixels of the photo (the first one's centre is at 0.5),
-NaN where there is none."""
-
+STRAIGHT_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""COLMAP's camera models that are a pinhole where all their parameters of distortion, if any, are 0."""
 WIDEST_ANGLE = math.radians(60.0)
 """Largest angle off the axis in the pinhole image: a fisheye's rim would become a smear."""
 LARGEST_GROWTH = 2.0
@@ -102,41 +100,47 @@ def _between(nodes: np.ndarray, before: np.ndarray, share: np.ndarray) -> np.nda
     return start + share * (nodes[before + 1] - start)
 
 
-def lens_of_camera(camera: pycolmap.Camera, owner: str, project: Projection | None = None) -> Lens:
-    """The lens of a camera of any of COLMAP's models.
+def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
+    """The lens of a camera of any of COLMAP's models; None for a pinhole.
 
     Args:
         owner: names the camera in messages.
-        project: the lens's projection where COLMAP's model is only near it; None: the camera's own.
 
     Raises:
         InputError: parameters that are not those of a lens; a panorama, which no pinhole camera can show.
     """
-    import pycolmap
-
-    model, photo_size = camera.model.name, (camera.width, camera.height)
+    model, extra = camera.model.name, list(camera.extra_params_idxs())
+    if model in STRAIGHT_MODELS and not camera.params[extra].any():
+        return None
     if not camera.is_perspective():
         raise InputError(
             f"{owner} is {model}, a panorama: cut it into perspective photos and reconstruct these "
             "(pycolmap's example panorama_sfm.py does both)"
         )
+    lens = _lens(model, (camera.width, camera.height), tuple(camera.params.tolist()))
+    if lens is None:
+        raise InputError(
+            f"{owner} is {model} with parameters that are not those of a lens: nothing of its photos can be "
+            "undistorted; reconstruct the capture again"
+        )
+    return lens
+
+
+@lru_cache(maxsize=64)
+def _lens(model: str, photo_size: tuple[int, int], params: tuple[float, ...]) -> Lens | None:
+    """The lens of a camera's numbers, which the cameras of many photos share; None where they are not those of one."""
+    import pycolmap
+
+    if not np.isfinite(params).all():
+        return None
+    camera = pycolmap.Camera(model=model, width=photo_size[0], height=photo_size[1], params=params)
     options = pycolmap.UndistortCameraOptions(
         blank_pixels=0.0, max_scale=LARGEST_GROWTH, max_cam_point_norm=math.tan(WIDEST_ANGLE)
     )
-    trouble = InputError(
-        f"{owner} is {model} with parameters that are not those of a lens: nothing of its photos can be undistorted; "
-        "reconstruct the capture again"
-    )
-    if not np.isfinite(camera.params).all():
-        raise trouble
     try:
         pinhole = pycolmap.undistort_camera(options, camera)
-    except Exception as error:  # pycolmap raises whatever C++ threw
-        raise trouble from error
-
-    def own(points: np.ndarray) -> np.ndarray:
-        return camera.img_from_cam(np.concatenate([points, np.ones((len(points), 1))], axis=1))
-
+    except Exception:  # pycolmap raises whatever C++ threw
+        return None
     focal = np.array([pinhole.focal_length_x, pinhole.focal_length_y])
     center = np.array([pinhole.principal_point_x, pinhole.principal_point_y])
     whole = np.array([pinhole.width, pinhole.height])
@@ -145,22 +149,24 @@ def lens_of_camera(camera: pycolmap.Camera, owner: str, project: Projection | No
         shifted = center - 0.5 * (whole - size)
         if min(size) < 1:
             break
-        if (nodes := _nodes(size / focal, -shifted / focal, project or own, photo_size)) is not None:
+        if (nodes := _nodes(size / focal, -shifted / focal, camera)) is not None:
             K = np.array([[focal[0], 0.0, shifted[0]], [0.0, focal[1], shifted[1]], [0.0, 0.0, 1.0]])
             return Lens(model, photo_size, (int(size[0]), int(size[1])), K, nodes)
-    raise trouble
+    return None
 
 
-def _nodes(extent: np.ndarray, corner: np.ndarray, project: Projection, sides: tuple[int, int]) -> np.ndarray | None:
+def _nodes(extent: np.ndarray, corner: np.ndarray, camera: pycolmap.Camera) -> np.ndarray | None:
     """`Lens.sources` of a pinhole image; None where the photo does not fill it, or shows some of it mirrored.
 
     Args:
         extent, corner: [2] width and height of the image, and its corner at the top left, at depth 1.
-        sides: (width, height) of the photo.
+        camera: of the photo.
     """
+    sides = (camera.width, camera.height)
     x, y = (np.linspace(corner[axis], corner[axis] + extent[axis], LATTICE) for axis in (0, 1))
     with np.errstate(all="ignore"):
-        nodes = project(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+        points = np.stack([*np.meshgrid(x, y), np.ones((LATTICE, LATTICE))], axis=-1)
+        nodes = camera.img_from_cam(points.reshape(-1, 3))  # NaN where there is none
         least, most = nodes.min(axis=0), nodes.max(axis=0)  # NaN fits nowhere
         fits = (least >= -LATTICE_EDGE) & (most <= np.add(sides, LATTICE_EDGE))
         fits &= most - least >= np.multiply(SMALLEST_SHARE, sides)
@@ -168,25 +174,6 @@ def _nodes(extent: np.ndarray, corner: np.ndarray, project: Projection, sides: t
         right, down = nodes[:-1, 1:] - nodes[:-1, :-1], nodes[1:, :-1] - nodes[:-1, :-1]
         upright = right[..., 0] * down[..., 1] > right[..., 1] * down[..., 0]
     return (2.0 * nodes / sides - 1.0).astype(np.float32) if fits.all() and upright.all() else None
-
-
-def brown_projection(
-    focal: Sequence[float], center: Sequence[float], radial: Sequence[float], p1: float, p2: float
-) -> Projection:
-    """OpenCV's model with any number of radial coefficients, all in the numerator as Metashape and nerfstudio have it.
-
-    COLMAP's models go to the third one, or put the fourth in a denominator (FULL_OPENCV).
-    """
-
-    def project(points: np.ndarray) -> np.ndarray:
-        x, y = points.T
-        squared = x * x + y * y
-        stretch = 1.0 + reduce(lambda rest, k: (rest + k) * squared, reversed(radial), 0.0)
-        bent_x = x * stretch + 2.0 * p1 * x * y + p2 * (squared + 2.0 * x * x)
-        bent_y = y * stretch + 2.0 * p2 * x * y + p1 * (squared + 2.0 * y * y)
-        return np.stack([focal[0] * bent_x + center[0], focal[1] * bent_y + center[1]], axis=1)
-
-    return project
 
 
 def undistortion_note(lenses: Sequence[Lens | None]) -> str:
