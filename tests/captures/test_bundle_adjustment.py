@@ -160,15 +160,6 @@ def test_any_coordinates(shift):
     assert np.linalg.norm(moved.seen(refined) - case.seen(case.true), axis=1).mean() < 0.1
 
 
-@pytest.mark.parametrize("chunk", [1, 10, 200])
-def test_how_observations_are_grouped_changes_no_bit(chunk, monkeypatch):
-    case = tracked(views=6, points=60)
-    together = refine_together(case.given, case.points, case.observations)
-    monkeypatch.setattr(bundle_adjustment, "CHUNK", chunk)
-    grouped = refine_together(case.given, case.points, case.observations)
-    assert same(together.cameras, grouped.cameras) and (together.points == grouped.points).all()
-
-
 def hostile(name: str) -> Tracked:
     """Observations that tell little, or lie."""
     case = tracked(views=4, points=40)
