@@ -269,7 +269,7 @@ def test_of_several_models_the_largest_is_taken_and_said(tmp_path):
     shutil.copytree(tmp_path / "1" / "images", folder / "images", dirs_exist_ok=True)
     scene = load_scene(folder)
     assert len(scene.train) + len(scene.test) == 9
-    said = "4 reconstructions in .*sparse: 1 is taken for most images .0 has 4, 1 has 9, 2 has 7, 10 has 9."
+    said = "4 reconstructions in .*sparse: 1 is taken, the largest; 0, 2, 10 not used"
     assert re.fullmatch(said, scene.notes[1])
     assert re.fullmatch("COLMAP reconstruction .*sparse/1 .binary.: 9 images, 20 points", scene.notes[0])
 

@@ -7,7 +7,7 @@ import pytest
 from helpers.refusals import assert_refused
 from PIL import ExifTags, Image
 
-from turbogs_plugin.captures import decoding, load, load_scene
+from turbogs_plugin.captures import decoding, load_scene
 from turbogs_plugin.captures.decoding import photo_sizes, reduced_sizes
 from turbogs_plugin.errors import InputError
 
@@ -27,13 +27,6 @@ def test_photos_that_are_small_already_are_taken_as_they_are():
 def test_a_factor_that_leaves_next_to_nothing_is_refused(factor):
     with pytest.raises(InputError, match=rf"--factor {factor} .*500x90: the largest .* is 25$"):
         reduced_sizes(SIZES, factor)
-
-
-def test_a_photo_of_more_pixels_than_a_draw_tells_apart_is_refused(capture, monkeypatch):
-    monkeypatch.setattr(load, "MOST_PIXELS", 48 * 40 - 1)
-    with pytest.raises(InputError, match="a photo would have 48x40 pixels, more than 1919: use --factor 2"):
-        load_scene(capture)
-    assert load_scene(capture, factor=2).train.cameras.sizes.max() == 24
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6])

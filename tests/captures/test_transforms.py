@@ -359,12 +359,12 @@ def test_lists_of_file_names_are_the_split(tmp_path, lists, train, test, said):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"test_filenames": ["images/f3.png", "images/g.png"]}, "names 'images/g.png', which is no frame's file_path"),
-        ({"val_filenames": "images/f3.png"}, "val_filenames is no list of file names"),
-        ({"train_filenames": [1]}, "train_filenames is no list of file names"),
-        ({"train_filenames": [], "test_filenames": []}, "leave no photo to train or to test on"),
-        ({"train_filenames": listed(*range(9))}, "leave no photo to train or to test on"),
-        ({"train_filenames": listed(1, 2, 3), "test_filenames": listed(3, 4)}, r"testing \(images/f3.png\)"),
+        ({"test_filenames": ["images/f3.png", "images/g.png"]}, "test_filenames are no split: give lists"),
+        ({"val_filenames": "images/f3.png"}, "val_filenames are no split"),
+        ({"train_filenames": [1]}, "are no split"),
+        ({"train_filenames": [], "test_filenames": []}, "train_filenames.* are no split"),
+        ({"train_filenames": listed(*range(9))}, "train_filenames.* are no split"),
+        ({"train_filenames": listed(1, 2, 3), "test_filenames": listed(3, 4)}, "are no split"),
         ({"train_filenames": listed(1, 2), "test_filenames": listed(3, 4)}, "2 training images: at least 3"),
     ],
 )

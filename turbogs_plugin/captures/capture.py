@@ -102,24 +102,6 @@ def named(names: Sequence[str], most: int = 3) -> str:
     return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
 
 
-def absence_notes(scene: Path, source: Path, absent: Sequence[str], count: int) -> list[str]:
-    """A note where photos of the `count` images that a file names do not exist.
-
-    Args:
-        absent: names of the photos that do not exist.
-
-    Raises:
-        InputError: fewer than `FEWEST_PHOTOS` remain.
-    """
-    if absent and count - len(absent) < FEWEST_PHOTOS:
-        raise InputError(
-            f"{source} names {count} photos, of which {len(absent)} are missing in {scene} ({named(absent)}): at "
-            f"least {FEWEST_PHOTOS} are needed; copy the photos there"
-        )
-    note = f"{len(absent)} of {count} images are left out, their photos do not exist: {named(absent, most=1)}"
-    return [note] if absent else []
-
-
 def require_printable(name: str, source: Path) -> None:
     """Raise `InputError` where a photo's name cannot be printed; `source` names it."""
     if not name.isprintable():

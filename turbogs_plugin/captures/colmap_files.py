@@ -91,18 +91,6 @@ def read_model(folder: Path, suffix: str) -> ColmapModel:
     return ColmapModel(model.cameras, model.images, model.points[np.argsort(model.points["id"], kind="stable")])
 
 
-def count_images(path: Path) -> int:
-    """Images that a file of images announces; damage is left to `read_model`."""
-    try:
-        if path.suffix == ".txt":
-            return sum(1 for _ in _pairs_of_lines(path))
-        with path.open("rb") as file:
-            announced = int.from_bytes(file.read(8), "little")
-        return min(announced, path.stat().st_size // SMALLEST_IMAGE)
-    except OSError:
-        return 0
-
-
 def read_poses(folder: Path, suffix: str, model: ColmapModel) -> dict[int, np.ndarray]:
     """[4, 4] float64 world to camera of each image, by its identifier.
 

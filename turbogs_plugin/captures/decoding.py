@@ -15,7 +15,7 @@ from torch import Tensor
 from turbogs_plugin.captures.undistort import Lens
 from turbogs_plugin.device import processor_cores
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.host_arrays import free_host_bytes, host_array
+from turbogs_plugin.scene.host_arrays import host_array
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 
 MODES = {3: "RGB", 4: "RGBa"}
@@ -24,14 +24,8 @@ SMALLEST_SIDE = 4
 """The shorter side of a reduced photo has at least this many pixels; of fewer, nothing is left to see."""
 OPAQUE_SUFFIXES = (".jpg", ".jpeg")
 """Suffixes of formats without alpha, whose headers need not be read again."""
-DECODING_BYTES = 24
-"""Bytes of a pixel while its photo is decoded, undistorted and reduced: several copies, one of them in float32."""
-MEMORY_SHARE = 0.25
-"""Photos that are being decoded may take this share of the free memory, with one thread more if need be."""
 MOST_THREADS = 16
-"""Photos are decoded by a thread a processor, but by no more than this."""
-SMALL_WORK = 2**30
-"""Bytes that are not worth a question."""
+"""Photos that are decoded at a time; undistorted and reduced, each takes up to 24 bytes a pixel."""
 
 
 def reduced_sizes(sizes: np.ndarray, factor: float) -> np.ndarray:
@@ -128,9 +122,8 @@ def load_photos(
         pixels[offsets[view] : offsets[view + 1]] = (values := np.asarray(photo)).reshape(-1, channels)
         return channels == 3 or bool((values[..., 3] == 255).all())
 
-    largest = int(sizes.prod(axis=1).max(initial=1))
     opaque = True
-    with decoding_threads(DECODING_BYTES * largest) as pool:
+    with decoding_threads() as pool:
         # The first error in order is raised, and ends what was not begun.
         for count, own in enumerate(pool.map(load, range(len(paths))), start=1):
             opaque &= own
@@ -146,15 +139,9 @@ def _room(sizes: np.ndarray, channels: int) -> Tensor:
     return host_array((int(pixel_offsets(sizes)[-1]), channels), torch.uint8, f"{len(sizes)} photos")
 
 
-def decoding_threads(bytes_each: int = 0) -> ThreadPoolExecutor:
-    """Threads to decode photos: one a processor of this process, but no more than `MEMORY_SHARE` of free memory allows.
-
-    Args:
-        bytes_each: memory that one thread takes.
-    """
-    wanted = min(MOST_THREADS, processor_cores())
-    affordable = int(MEMORY_SHARE * free_host_bytes()) // bytes_each if wanted * bytes_each > SMALL_WORK else wanted
-    return ThreadPoolExecutor(max(1, min(wanted, affordable)))
+def decoding_threads() -> ThreadPoolExecutor:
+    """Threads to decode photos: one a processor of this process, at most `MOST_THREADS`."""
+    return ThreadPoolExecutor(max(1, min(MOST_THREADS, processor_cores())))
 
 
 def _decode(path: Path, size: tuple[int, int], mode: str) -> Image.Image:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -28,9 +27,6 @@ from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.scene.scene import PosedImages, Scene
 from turbogs_plugin.types import Cameras
 
-MOST_PIXELS = 1 << 28
-"""Pixels of a photo as it is trained on. Where tiles are drawn whole, a draw tells 2^20 of a view apart (`RANK_BITS` of
-engine/reference/draws.py)."""
 FARTHEST = 1e15
 """Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
 
@@ -214,23 +210,16 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
     """The files to read where photos are to be reduced by `factor`: copies in ``images_<factor>`` where all are there
     in the right size, else the capture's photos. Photos of ``images_4`` that are smaller than their cameras by that are
     reduced already."""
-    files = _reduced_copies(scene, capture, factor)
-    if files is None:
-        paths = [capture.photo_folder / name for name in capture.names]
-        sizes = photo_sizes(paths)
-        note = _require_scaled(paths, sizes, capture.photo_sizes)
-        reduction = re.fullmatch(rf"{IMAGES}_(\d+)", capture.photo_folder.name)
-        smaller = capture.photo_sizes[0, 0] > 1.5 * sizes[0, 0]
-        already = int(reduction[1]) if reduction and smaller else 1
-        targets = reduced_sizes(_undistorted_sizes(capture, sizes), max(1.0, factor / already))
-        files = PhotoFiles(paths, sizes, targets, note)
-    largest = files.sizes[np.argmax(files.sizes.prod(axis=1))]
-    if largest.prod() > MOST_PIXELS:
-        raise InputError(
-            f"{scene}: a photo would have {largest[0]}x{largest[1]} pixels, more than {MOST_PIXELS}: use --factor "
-            f"{factor * math.ceil(math.sqrt(largest.prod() / MOST_PIXELS))}"
-        )
-    return files
+    if (copies := _reduced_copies(scene, capture, factor)) is not None:
+        return copies
+    paths = [capture.photo_folder / name for name in capture.names]
+    sizes = photo_sizes(paths)
+    note = _require_scaled(paths, sizes, capture.photo_sizes)
+    reduction = re.fullmatch(rf"{IMAGES}_(\d+)", capture.photo_folder.name)
+    smaller = capture.photo_sizes[0, 0] > 1.5 * sizes[0, 0]
+    already = int(reduction[1]) if reduction and smaller else 1
+    targets = reduced_sizes(_undistorted_sizes(capture, sizes), max(1.0, factor / already))
+    return PhotoFiles(paths, sizes, targets, note)
 
 
 def _reduced_copies(scene: Path, capture: Capture, factor: int) -> PhotoFiles | None:

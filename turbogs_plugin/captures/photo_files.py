@@ -7,10 +7,11 @@ import re
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from turbogs_plugin.captures.capture import FEWEST_PHOTOS, require_printable
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, named, require_printable
 from turbogs_plugin.errors import InputError
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
@@ -94,9 +95,26 @@ def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | 
     return next((form for form in forms if (scene / form).is_file()), None)
 
 
+@dataclass(frozen=True)
+class FoundPhotos:
+    """The photos of a capture that are there, in the order of their names.
+
+    Args:
+        folder: that all of them lie in: one in the scene, else the scene.
+        names: relative to the folder.
+        places: of the photos among the names that the capture has.
+        notes: lines for the user, on photos that are not where the capture says and on those that are nowhere.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    places: list[int]
+    notes: list[str]
+
+
 def find_named(
     scene: Path, names: Sequence[str], source: Path, folders: Sequence[str], others: Collection[str] = ()
-) -> tuple[list[str | None], list[str]]:
+) -> FoundPhotos:
     """The photos that a capture names: the one rule for every kind of capture.
 
     - A photo counts that is where its name says (`file_named`), in the first of `folders` that has it; where fewer than
@@ -111,12 +129,8 @@ def find_named(
         folders: in the scene, that names are relative to; '' for the scene itself.
         others: names of files that are no photos.
 
-    Returns:
-        The photos' paths relative to the scene, None where there is no photo; a note or none on photos that are not
-        where their names say.
-
     Raises:
-        InputError: a name that cannot be printed, or a photo that is named twice.
+        InputError: a name that cannot be printed, a photo that is named twice, or fewer than `FEWEST_PHOTOS` photos.
     """
     found: list[str | None] = []
     for places in (folders, *([folder] for folder in REDUCED)):
@@ -130,21 +144,28 @@ def find_named(
     written = [path or PureWindowsPath(name).as_posix() for path, name in zip(found, names, strict=True)]
     if twice := [path for path, times in Counter(written).items() if times > 1]:
         raise InputError(f"{source} names the photo {twice[0]} twice: take one out, or rename the photos")
-    if None not in found:
-        return found, []
-    index = _index(scene, {*written, *(PureWindowsPath(other).as_posix() for other in others)})
     missing = [place for place, path in enumerate(found) if path is None]
+    index = {} if not missing else _index(scene, {*written, *(PureWindowsPath(other).as_posix() for other in others)})
     moved = _distinct({place: _best(_beside(index, names[place], folders), names[place]) for place in missing})
     if not moved and len(missing) == len(found):
         moved = _distinct({place: _best(index.get(_stem(names[place]), []), names[place]) for place in missing})
-    paths = [moved.get(place, path) for place, path in enumerate(found)]
-    return paths, _moved_note(names, moved, source)
-
-
-def common_folder(scene: Path, paths: Sequence[str]) -> Path:
-    """The folder in the scene that all photos lie in, whose paths are relative to the scene; else the scene itself."""
-    first = {parts[0] if len(parts := PurePosixPath(path).parts) > 1 else "" for path in paths}
-    return scene / first.pop() if len(first) == 1 else scene
+    pairs = sorted((moved.get(place) or path or "", place) for place, path in enumerate(found))
+    pairs = [(path, place) for path, place in pairs if path]
+    absent = [written[place] for place in missing if place not in moved]
+    if absent and len(pairs) < FEWEST_PHOTOS:
+        raise InputError(
+            f"{source} names {len(names)} photos, of which {len(absent)} are missing in {scene} ({named(absent)}): at "
+            f"least {FEWEST_PHOTOS} are needed; copy the photos there"
+        )
+    note = f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {named(absent, most=1)}"
+    inner = {path.split("/")[0] if "/" in path else "" for path, _ in pairs}
+    folder = scene / inner.pop() if len(inner) == 1 else scene
+    return FoundPhotos(
+        folder,
+        tuple((scene / path).relative_to(folder).as_posix() for path, _ in pairs),
+        [place for _, place in pairs],
+        [*_moved_note(names, moved, source), *([note] if absent else [])],
+    )
 
 
 def _moved_note(names: Sequence[str], moved: dict[int, str], source: Path) -> list[str]:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from turbogs_plugin.captures.camera_json import opengl_viewmat, read_camera, read_frames
-from turbogs_plugin.captures.capture import Capture, absence_notes
-from turbogs_plugin.captures.photo_files import common_folder, file_named, find_named
+from turbogs_plugin.captures.capture import Capture
+from turbogs_plugin.captures.photo_files import file_named, find_named
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.ply import read_colors, read_vertices
 
@@ -98,35 +98,29 @@ def _capture(
     """
     names = [_written(frame) for frame in frames]
     others = {text for frame in frames for key, text in frame.items() if key != "file_path" and isinstance(text, str)}
-    paths, moved = find_named(scene, [frame["file_path"] for frame in frames], source, ("", "images"), others)
-    absent = [name for name, path in zip(names, paths, strict=True) if path is None]
-    absence = absence_notes(scene, source, absent, len(names))
-    views = sorted((path, place) for place, path in enumerate(paths) if path is not None)
-    folder = common_folder(scene, [path for path, _ in views])
+    found = find_named(scene, [frame["file_path"] for frame in frames], source, ("", "images"), others)
     viewmats, Ks, sizes, lenses, masks = [], [], [], [], []
-    for path, place in views:
-        frame = frames[place]
-        viewmats.append(
-            opengl_viewmat(frame.get("transform_matrix"), f"{source}: the transform_matrix of frame '{path}'")
-        )
-        K, size, lens = read_camera(frame, scene / path, source)
+    for name, place in zip(found.names, found.places, strict=True):
+        frame, owner = frames[place], f"frame '{names[place]}'"
+        viewmats.append(opengl_viewmat(frame.get("transform_matrix"), f"{source}: the transform_matrix of {owner}"))
+        K, size, lens = read_camera(frame, found.folder / name, source)
         Ks.append(K)
         sizes.append(size)
         lenses.append(lens)
         mask = frame.get("mask_path")
-        masks.append(None if mask is None else _file(scene, mask, f"mask_path of frame '{path}'", source))
-    tested = np.array([names[place] in (test or ()) for _, place in views])
+        masks.append(None if mask is None else _file(scene, mask, f"mask_path of {owner}", source))
+    tested = np.array([names[place] in (test or ()) for place in found.places])
     split = f", by its own split {(~tested).sum()} for training, {tested.sum()} for testing" if tested.any() else ""
     return Capture(
-        names=tuple((scene / path).relative_to(folder).as_posix() for path, _ in views),
-        photo_folder=folder,
+        names=found.names,
+        photo_folder=found.folder,
         viewmats=np.array(viewmats),
         Ks=np.array(Ks),
         sizes=np.array(sizes),
         points=np.empty((0, 3)) if points is None else points,
         point_colors=colors,
         lenses=tuple(lenses),
-        notes=(f"{source} ({words}): {len(views)} photos{split}", *moved, *absence),
+        notes=(f"{source} ({words}): {len(found.names)} photos{split}", *found.notes),
         test=tested if tested.any() else None,
         mask_files=tuple(masks),
     ).checked(source)
@@ -139,27 +133,23 @@ def _own_split(content: dict[str, Any], frames: list[Frame], source: Path) -> tu
     photos that are not for training are tests. Without ``train_filenames``, what is in no other list trains.
 
     Raises:
-        InputError: a list that is none or names a photo without a frame; lists that are no split.
+        InputError: lists that are no split.
     """
-    everything = {_written(frame) for frame in frames}
-    lists: dict[str, set[str]] = {}
-    for key in (key for key in LISTS if key in content):
-        listed = content[key]
-        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-            raise InputError(f"{source}: {key} is no list of file names: write one, or take it out")
-        lists[key] = {PureWindowsPath(name).as_posix() for name in listed}
-        if strange := sorted(lists[key] - everything):
-            raise InputError(f"{source}: {key} names '{strange[0]}', which is no frame's file_path: take it out")
+    lists = {key: content[key] for key in LISTS if key in content}
     if not lists:
         return None
-    test, validation = lists.get(TEST, set()), lists.get(VALIDATION, set())
-    train = lists.get(TRAIN, everything - test - validation)
-    test = test or validation or everything - train
-    if both := sorted(train & test):
-        raise InputError(f"{source}: {len(both)} photos are for training and for testing ({both[0]}): mend its lists")
-    if not train or not test:
-        raise InputError(f"{source}: its lists ({', '.join(lists)}) leave no photo to train or to test on: mend them")
-    return train, test
+    everything = {_written(frame) for frame in frames}
+    if all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists.values()):
+        named = {key: {PureWindowsPath(name).as_posix() for name in names} for key, names in lists.items()}
+        test, validation = named.get(TEST, set()), named.get(VALIDATION, set())
+        train = named.get(TRAIN, everything - test - validation)
+        test = test or validation or everything - train
+        if train and test and not train & test and train | test | validation <= everything:
+            return train, test
+    raise InputError(
+        f"{source}: {', '.join(lists)} are no split: give lists of frames' file_path, with photos to train and to test "
+        "on and none for both"
+    )
 
 
 def _file(scene: Path, name: Any, what: str, source: Path) -> Path:
