@@ -106,7 +106,6 @@ def test_mutated_lenses(capture, tmp_path, model):
             errors += 1
         else:
             assert np.isfinite(result.Ks).all() and (result.sizes >= 1).all() and (result.sizes <= 64).all()
-            assert all(lens is None or np.abs(lens.sources).max() < 1.1 for lens in result.lenses)
     assert 10 < errors < 100
 
 

@@ -115,8 +115,7 @@ def load_photos(
         photo = _decode(paths[view], tuple(sizes[view].tolist()), MODES[channels])
         lens = lenses[view]
         if lens is not None:
-            size = lens.size_of(photo.size)
-            photo = Image.frombytes(photo.mode, size, lens.undistort(np.asarray(photo), size).tobytes())
+            photo = lens.undistort(photo)
         if photo.size != target:
             photo = photo.resize(target, Image.Resampling.BOX)
         pixels[offsets[view] : offsets[view + 1]] = (values := np.asarray(photo)).reshape(-1, channels)

@@ -223,15 +223,16 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
 
 
 def _reduced_copies(scene: Path, capture: Capture, factor: int) -> PhotoFiles | None:
-    """The copies in the folder beside the photos; None where one is missing or of another size."""
+    """The copies in the folder beside the photos; None where one is missing or of another size, or is to be
+    undistorted, which is done in full size."""
     folder = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
     paths = [folder / name for name in capture.names]
-    if factor == 1 or capture.photo_folder == scene or not all(path.is_file() for path in paths):
+    if factor == 1 or capture.photo_folder == scene or any(capture.lenses) or not all(map(Path.is_file, paths)):
         return None
     sizes = photo_sizes(paths)
     if (np.abs(sizes - capture.photo_sizes / factor) > 1.0).any():
         return None
-    return PhotoFiles(paths, sizes, _undistorted_sizes(capture, sizes))
+    return PhotoFiles(paths, sizes, sizes)
 
 
 def _undistorted_sizes(capture: Capture, sizes: np.ndarray) -> np.ndarray:

@@ -128,8 +128,7 @@ def require_mask_size(
 def _placed(keep: np.ndarray, lens: Lens | None, target: tuple[int, int]) -> np.ndarray:
     """[H, W] bool: the mask after what is done to its photo."""
     if lens is not None:
-        image = np.where(keep, np.uint8(255), np.uint8(0))[:, :, None]
-        keep = np.equal(lens.undistort(image, lens.size_of((keep.shape[1], keep.shape[0])))[:, :, 0], 255)
+        keep = np.asarray(lens.undistort(Image.fromarray(np.where(keep, np.uint8(255), np.uint8(0))))) == 255
     return _reduced(keep, target)
 
 
