@@ -1,6 +1,5 @@
 """COLMAP captures: what is read, in which frame, at which size; and what is refused, with which words."""
 
-import os
 import re
 import shutil
 import unicodedata
@@ -16,8 +15,6 @@ from PIL import Image
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import find_model, read_colmap
 from turbogs_plugin.errors import InputError
-
-SCENES = Path(os.environ.get("TURBOGS_SCENES", Path(__file__).resolve().parents[3] / "shared" / "scenes"))
 
 
 def rotation(angle: float) -> np.ndarray:
@@ -109,20 +106,6 @@ def test_place_and_unit_of_the_capture_do_not_matter(tmp_path, scale):
     np.testing.assert_allclose(far.points, near.points, atol=tolerance)
     np.testing.assert_allclose(far.train.cameras.viewmats, near.train.cameras.viewmats, atol=tolerance)
     assert far.frame.scale == pytest.approx(scale * near.frame.scale, rel=tolerance)
-
-
-def test_several_cameras_sizes_and_nested_folders(tmp_path):
-    cameras = (("PINHOLE", 40, 24, [50.0, 52.0, 21.0, 11.0]), ("SIMPLE_PINHOLE", 16, 33, [30.0, 8.0, 16.0]))
-    scene = load_scene(write_capture(tmp_path / "cup", cameras=cameras, nested=True, views=10))
-    # In name order the even photos (folder left/0, camera 0) come first.
-    assert scene.test.names == ("left/0/photo00.png", "left/1/photo07.png")
-    assert scene.train.names[0] == "left/0/photo02.png" and len(scene.train) == 8
-    sizes = {name: size.tolist() for name, size in zip(scene.train.names, scene.train.cameras.sizes, strict=True)}
-    assert sizes["left/0/photo04.png"] == [40, 24] and sizes["left/1/photo05.png"] == [16, 33]
-    view = scene.train.names.index("left/1/photo05.png")
-    np.testing.assert_allclose(scene.train.cameras.Ks[view], [[30, 0, 8], [0, 30, 16], [0, 0, 1]])
-    assert scene.train.photos.image(view).shape == (33, 16, 3)
-    np.testing.assert_allclose(scene.train.photos.image(view)[20, 3] * 255, [18, 120, 100], atol=1e-4)
 
 
 def test_factor_scales_intrinsics_by_the_actual_sizes(tmp_path):
@@ -230,37 +213,6 @@ def test_a_model_without_images_is_refused(tmp_path):
         load_scene(tmp_path)
 
 
-def test_the_alpha_of_a_photo_is_a_mask(tmp_path):
-    """Any that is not zero keeps its pixel, in the colour that it has."""
-    folder = write_capture(tmp_path / "cup")
-    photo = Image.new("RGBA", (40, 24), (200, 100, 50, 51))
-    photo.paste((255, 255, 255, 0), (0, 0, 40, 6))
-    photo.save(folder / "images" / "photo01.png")
-    scene = load_scene(folder)
-    train = scene.train
-    assert scene.notes[-1] == "1 photos have masked pixels, 25.0% of them"
-    assert train.photos.image(0)[10, 0].mul(255).tolist() == [200, 100, 50]
-    expected = np.zeros((24, 40), dtype=bool)
-    expected[6:] = True
-    assert np.array_equal(train.mask(0), expected) and train.mask(1) is None
-
-
-@pytest.mark.skipif(not (SCENES / "fox").is_dir(), reason=f"no real captures in {SCENES}")
-def test_real_capture():
-    scene = load_scene(SCENES / "fox", factor=4)
-    assert (len(scene.train), len(scene.test), len(scene.points)) == (43, 7, 15579)
-    assert scene.train.photos.sizes.tolist() == [[210, 375]] * 43
-    # Points are where photos have their colour: most project to a pixel of about their own.
-    cameras, image = scene.train.cameras, scene.train.photos.image(20)
-    local = scene.points @ cameras.viewmats[20, :3, :3].T + cameras.viewmats[20, :3, 3]
-    pixels = local @ cameras.Ks[20].T
-    pixels = (pixels[:, :2] / pixels[:, 2:]).floor().long()
-    shown = (local[:, 2] > 0) & (pixels >= 0).all(dim=1) & (pixels < torch.tensor([210, 375])).all(dim=1)
-    differences = image[pixels[shown, 1], pixels[shown, 0]] - scene.point_colors[shown] / 255
-    shifted = image[pixels[shown, 1], 209 - pixels[shown, 0]] - scene.point_colors[shown] / 255
-    assert differences.abs().mean(dim=1).median() < 0.6 * shifted.abs().mean(dim=1).median()
-
-
 def test_of_several_models_the_largest_is_taken_and_said(tmp_path):
     folder = write_capture(tmp_path / "cup", views=4)
     for name, views in (("1", 9), ("2", 7), ("10", 9)):
@@ -272,19 +224,6 @@ def test_of_several_models_the_largest_is_taken_and_said(tmp_path):
     said = "4 reconstructions in .*sparse: 1 is taken, the largest; 0, 2, 10 not used"
     assert re.fullmatch(said, scene.notes[1])
     assert re.fullmatch("COLMAP reconstruction .*sparse/1 .binary.: 9 images, 20 points", scene.notes[0])
-
-
-@pytest.mark.parametrize("place", [".", "photos", "rgb/left"])
-def test_photos_in_other_folders(tmp_path, place):
-    folder = write_capture(tmp_path / "captures" / "cup", nested=True)
-    (folder / "images").rename(tmp_path / "photos")
-    if place == ".":
-        (tmp_path / "photos" / "left").rename(folder / "left")
-    else:
-        (folder / place).resolve().parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / "photos").rename((folder / place).resolve())
-    scene = load_scene(folder)
-    assert len(scene.train) == 7 and "photos in " in scene.notes[0]
 
 
 def test_copies_that_the_cameras_were_reconstructed_from(tmp_path):
@@ -329,27 +268,6 @@ def test_a_point_that_is_too_far_for_float32_is_refused(tmp_path, place, refused
         load_scene(folder)
 
 
-@pytest.mark.parametrize("other", ["depth", "normals", "segmentation", "images_backup", "images_2"])
-@pytest.mark.parametrize("kept", [3, 8])
-def test_where_photos_were_taken_away_no_other_folder_stands_in(tmp_path, other, kept):
-    """It has images of all names, which may be depth maps, copies or another capture's photos."""
-    folder = write_capture(tmp_path / "cup")
-    shutil.copytree(folder / "images", folder / other)
-    for photo in sorted((folder / "images").iterdir())[: 9 - kept]:
-        photo.unlink()
-    capture = read_colmap(folder, *find_model(folder))
-    assert capture.photo_folder == folder / "images" and len(capture.names) == kept
-    assert capture.notes[1].startswith(f"{9 - kept} of 9 images are left out, ")
-
-
-@pytest.mark.parametrize("other", ["depth", "normals", "segmentation"])
-def test_images_that_are_no_photos_do_not_stand_in_for_all(tmp_path, other):
-    folder = write_capture(tmp_path / "cup")
-    (folder / "images").rename(folder / other)
-    with pytest.raises(InputError, match="of which 9 are missing"):
-        load_scene(folder)
-
-
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
 def test_names_with_spaces(tmp_path, suffix):
     folder = write_capture(tmp_path / "cup")
@@ -371,44 +289,6 @@ def test_a_name_of_a_text_model_that_is_not_utf_8_is_refused(tmp_path):
     images.write_bytes(images.read_bytes().replace(b"photo03.png", b"ph\xf6to03.png"))
     words = r"sparse/0: image name 'ph\\udcf6to03.png' has signs that cannot be printed: rename the photo"
     assert_refused(words, load_scene, folder)
-
-
-@pytest.mark.parametrize(
-    "written",
-    [
-        "{}.PNG",
-        "{}.jpg",
-        "./{}.png",
-        "images/{}.png",
-        "/home/me/cup/images/{}.png",
-        "C:\\cup\\images\\{}.png",
-        "../cup/{}.png",
-    ],
-)
-def test_names_of_other_programs_and_machines(tmp_path, written):
-    """Suffix and letters, folders before the name, absolute or Windows' paths: the one rule of all captures."""
-    folder = write_capture(tmp_path / "cup")
-    right = load_scene(folder)
-    model = pycolmap.Reconstruction(folder / "sparse/0")
-    for image in model.images.values():
-        image.name = written.format(image.name[:-4])
-    model.write_binary(folder / "sparse/0")
-    scene = load_scene(folder)
-    assert scene.train.names == right.train.names and torch.equal(scene.train.photos.colors, right.train.photos.colors)
-    assert torch.equal(scene.train.cameras.viewmats, right.train.cameras.viewmats)
-
-
-@pytest.mark.parametrize("form", ["NFC", "NFD"])
-def test_names_in_both_forms_of_unicode(tmp_path, form):
-    folder = write_capture(tmp_path / "cup")
-    model = pycolmap.Reconstruction(folder / "sparse/0")
-    other = "NFD" if form == "NFC" else "NFC"
-    for image in model.images.values():
-        name = image.name.replace("photo", "fot\u00f3")
-        (folder / "images" / image.name).rename(folder / "images" / unicodedata.normalize(form, name))
-        image.name = unicodedata.normalize(other, name)
-    model.write_binary(folder / "sparse/0")
-    assert len(load_scene(folder).train) == 7
 
 
 @pytest.mark.parametrize(("size", "fits"), [((20, 12), True), ((21, 12), True), ((80, 48), True), ((20, 15), False)])
@@ -473,3 +353,34 @@ def test_rigs(tmp_path):
     assert set(capture.names) == set(expected)
     for name, viewmat in zip(capture.names, capture.viewmats, strict=True):
         np.testing.assert_allclose(viewmat, expected[name], atol=1e-9)
+
+
+@pytest.mark.parametrize("other", ["depth", "segmentation", "images_backup", "images_2"])
+@pytest.mark.parametrize("kept", [0, 3, 8])
+def test_where_photos_were_taken_away_no_other_folder_stands_in(tmp_path, other, kept):
+    """It has images of all names, which may be depth maps, copies or another capture's photos."""
+    folder = write_capture(tmp_path / "cup")
+    shutil.copytree(folder / "images", folder / other)
+    for photo in sorted((folder / "images").iterdir())[: 9 - kept]:
+        photo.unlink()
+    if kept:
+        capture = read_colmap(folder, *find_model(folder))
+        assert capture.photo_folder == folder / "images" and len(capture.names) == kept
+        assert capture.notes[1].startswith(f"{9 - kept} of 9 images are left out, ")
+    elif not other.startswith("images"):
+        assert_refused("of which 9 are missing", load_scene, folder)
+
+
+@pytest.mark.parametrize("written", ["{}.PNG", "{}.jpg", "./{}.png", "images/{}.png", "C:\\cup\\images\\{}.png", "NFD"])
+def test_names_of_other_programs_and_machines(tmp_path, written):
+    """Suffix and letters, folders before the name, Windows' paths, forms of Unicode: the one rule of all captures."""
+    folder = write_capture(tmp_path / "cup")
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    for image in model.images.values():
+        name = image.name.replace("photo", "fot\u00f3")
+        (folder / "images" / image.name).rename(folder / "images" / name)
+        image.name = unicodedata.normalize("NFD", name) if written == "NFD" else written.format(name[:-4])
+    model.write_binary(folder / "sparse/0")
+    scene = load_scene(folder)
+    assert scene.train.names == tuple(f"fot\u00f3{view:02d}.png" for view in range(1, 8))
+    np.testing.assert_allclose(scene.train.photos.image(3)[5, 7] * 255, [42, 30, 80], atol=1e-4)

@@ -70,7 +70,7 @@ def test_mutated_models(capture, tmp_path, file, suffix):
         (tmp_path / path.name).write_bytes(content)
     choice = random.Random(f"{file}{suffix}")
     target = tmp_path / f"{file}{suffix}"
-    content, errors, cases = target.read_bytes(), 0, 120
+    content, errors, cases = target.read_bytes(), 0, 60
     for _ in range(cases):
         target.write_bytes(mutate(content, choice))
         result = outcome_within(MEMORY, read_colmap, capture, tmp_path, suffix)
@@ -82,7 +82,7 @@ def test_mutated_models(capture, tmp_path, file, suffix):
     assert errors > (0.5 if suffix == ".bin" else 0.15) * cases
 
 
-@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"])
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
 def test_mutated_lenses(capture, tmp_path, model):
     """Lenses of any numbers: a pinhole that the photo fills, or an error; the photos' size bounds the work."""
     for path in (capture / "sparse/0").iterdir():
@@ -93,7 +93,7 @@ def test_mutated_lenses(capture, tmp_path, model):
     intact = bytes(cameras) + lens.params.tobytes()
     choice, errors, target = random.Random(model), 0, tmp_path / "cameras.bin"
     first = len(cameras)
-    for _ in range(100):
+    for _ in range(40):
         data = bytearray(intact)
         place = choice.randrange(first, len(data), 8)
         value = choice.choice(
@@ -106,22 +106,11 @@ def test_mutated_lenses(capture, tmp_path, model):
             errors += 1
         else:
             assert np.isfinite(result.Ks).all() and (result.sizes >= 1).all() and (result.sizes <= 64).all()
-    assert 10 < errors < 100
+    assert 4 < errors < 40
 
 
 @pytest.mark.parametrize("file", FILES)
-@pytest.mark.parametrize("length", [0, 1, 7, 8, 20, -1])
-def test_truncated_binaries(capture, tmp_path, file, length):
-    for path in (capture / "sparse/0").iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    target = tmp_path / f"{file}.bin"
-    target.write_bytes(target.read_bytes()[:length])
-    with pytest.raises(InputError, match=f"{file}.bin is damaged"):
-        read_colmap(capture, tmp_path, ".bin")
-
-
-@pytest.mark.parametrize("file", FILES)
-@pytest.mark.parametrize("count", [2**31, 2**60, 2**64 - 1])
+@pytest.mark.parametrize("count", [2**31, 2**64 - 1])
 def test_counts_beyond_the_file(capture, tmp_path, file, count):
     for path in (capture / "sparse/0").iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
@@ -155,22 +144,6 @@ def test_bad_values(capture, tmp_path, file, place, replacement, words):
     target.write_bytes(content)
     with pytest.raises(InputError, match=words):
         read_colmap(capture, tmp_path, ".bin")
-
-
-def test_mutated_ply(model_ply, tmp_path):
-    choice, content, errors = random.Random(1), model_ply.read_bytes(), 0
-    header = content.index(b"end_header") + 11
-    target = tmp_path / "mutated.ply"
-    for case in range(300):
-        # Every second case goes for the header, which is the smaller part.
-        mutated = mutate(content[:header], choice) + content[header:] if case % 2 else mutate(content, choice)
-        target.write_bytes(mutated)
-        result = outcome_within(MEMORY, load_ply, target)
-        if isinstance(result, InputError):
-            errors += 1
-        else:
-            assert all(value.isfinite().all() for _, value in result.items())
-    assert errors > 150
 
 
 @pytest.mark.parametrize(
