@@ -49,7 +49,8 @@ def find_cameras(scene: Scene, training: bool = True) -> RefinedCameras | None:
     if shown is None or tested is None:
         return None
     together = refine_together(_pinholes(scene.train.cameras), places, shown)
-    train, points, error, notes = scene.train.cameras, scene.points, together.before, ()
+    train, points, error = scene.train.cameras, scene.points, together.before
+    notes: tuple[str, ...] = ()
     if training and together.count:
         places, error, notes = together.points, together.after, (together.text("training cameras"),)
         train, points = _cameras(together.cameras, train), torch.from_numpy(places).float()

@@ -136,9 +136,10 @@ def _fits(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> bool:
     """True where the photo of a camera fills the pinhole image, and shows none of it mirrored."""
     sides = (camera.width, camera.height)
     x, y = (np.linspace(0.0, side, GRID) for side in (pinhole.width, pinhole.height))
+    K = pinhole.calibration_matrix()
+    rays = np.stack([*np.meshgrid((x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]), np.ones((GRID, GRID))], axis=-1)
     with np.errstate(all="ignore"):
-        rays = pinhole.cam_from_img(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-        places = camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))  # NaN where there is none
+        places = np.asarray(camera.img_from_cam(rays.reshape(-1, 3)))  # NaN where there is none
         least, most = places.min(axis=0), places.max(axis=0)  # NaN fits nowhere
         fits = (least >= -EDGE) & (most <= np.add(sides, EDGE)) & (most - least >= np.multiply(SMALLEST_SHARE, sides))
         places = places.reshape(GRID, GRID, 2)
