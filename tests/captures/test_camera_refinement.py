@@ -39,8 +39,7 @@ def unchanged(before: Scene, now: Scene, split: str) -> bool:
     return first.viewmats.equal(second.viewmats) and first.Ks.equal(second.Ks)
 
 
-@pytest.mark.parametrize("suffix", [".bin", ".txt"])
-@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV"])
+@pytest.mark.parametrize(("suffix", "model"), [(".bin", "OPENCV"), (".txt", "PINHOLE")])
 def test_where_photos_show_points_is_read(tmp_path, suffix, model):
     scene = load_scene(write_tracked(tmp_path / "cup", CASE, suffix, model))
     shown = scene.train.observations

@@ -16,15 +16,9 @@ def capture(tmp_path_factory):
     return write_demo_capture(tmp_path_factory.mktemp("demo") / "capture", views=12, width=80, height=60)
 
 
-def test_loads_like_any_capture(capture):
-    scene = load_scene(capture)
-    assert (len(scene.train), len(scene.test)) == (10, 2)
-    assert scene.train.photos.sizes.tolist() == [[80, 60]] * 10
-    assert len(scene.points) > 1000 and scene.extent == 1.0
-
-
 def test_points_lie_where_photos_have_their_colour(capture):
     scene = load_scene(capture)
+    assert (len(scene.train), len(scene.test)) == (10, 2) and len(scene.points) > 1000
     cameras = scene.train.cameras
     local = scene.points @ cameras.viewmats[4, :3, :3].T + cameras.viewmats[4, :3, 3]
     pixels = local @ cameras.Ks[4].T

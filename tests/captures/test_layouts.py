@@ -117,33 +117,20 @@ def write_nerfstudio(folder: Path, cameras: list[pycolmap.Camera], names: list[s
     (folder / "sparse_pc.ply").write_text(header + "".join(f"{x} {y} {z} 9 8 7\n" for x, y, z in POINTS))
 
 
-@pytest.mark.parametrize("colmap", [True, False])
-def test_nerfstudio(tmp_path, colmap):
-    """images, images_2, ..., sparse_pc.ply and often COLMAP's own folder."""
+@pytest.mark.parametrize("model", ["colmap/sparse/0", "colmap_sparse/0", "colmap_text", ""])
+def test_nerfstudio_and_instant_ngp(tmp_path, model):
+    """images, images_2, ..., and often COLMAP's own folder, or one that colmap2nerf.py names."""
     camera, names = [pinhole(240, 160, 200.0)], [f"frame_{view + 1:05d}.png" for view in range(VIEWS)]
     write_nerfstudio(tmp_path / "poster", camera, [f"images/{name}" for name in names])
     write_photos(tmp_path / "poster/images", camera, names)
     write_photos(tmp_path / "poster/images_4", camera, names, 4)
-    if colmap:
-        write_model(tmp_path / "poster/colmap/sparse/0", camera, names)
+    if model:
+        write_model(tmp_path / "poster" / model, camera, names, ".txt" if "text" in model else ".bin")
     for factor in (1, 4):
         scene = load_scene(tmp_path / "poster", factor)
         require_painted(scene)
         assert scene.train.cameras.sizes[0].tolist() == [240 // factor, 160 // factor] and len(scene.points) == 3
-    assert ("transforms.json not used" in scene.notes) == colmap
-
-
-@pytest.mark.parametrize(("model", "suffix"), [("colmap_sparse/0", ".bin"), ("colmap_text", ".txt")])
-def test_instant_ngp(tmp_path, model, suffix):
-    """transforms.json without points, and COLMAP's model in folders of colmap2nerf.py's names."""
-    camera = [pinhole(240, 160, 200.0)]
-    write_nerfstudio(tmp_path / "fox", camera, [f"images/{name}" for name in NAMES])
-    write_photos(tmp_path / "fox/images", camera, NAMES)
-    write_model(tmp_path / "fox" / model, camera, NAMES, suffix)
-    scene = load_scene(tmp_path / "fox")
-    require_painted(scene)
-    assert f"COLMAP reconstruction {tmp_path / 'fox' / model} " in scene.notes[0] and len(scene.points) == 3
-    assert scene.notes[1:] == ("transforms.json not used",)
+    assert ("transforms.json not used" in scene.notes) == bool(model)
 
 
 @pytest.mark.parametrize("trouble", ["photos", "damaged", "incomplete"])
