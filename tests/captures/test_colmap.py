@@ -300,48 +300,23 @@ def test_photos_in_other_sizes_than_their_cameras(tmp_path, size, fits):
 
 
 def test_rigs(tmp_path):
-    """Two cameras on one rig: every image has its own pose, composed by hand here."""
-    reconstruction = pycolmap.Reconstruction()
-    offset = np.concatenate([rotation(0.3), [[1.0], [0.5], [0.0]]], axis=1)  # the second camera from the rig
-    rig = pycolmap.Rig(rig_id=1)
-    for number in (1, 2):
-        camera = pycolmap.Camera(camera_id=number, model="PINHOLE", width=40, height=24, params=[50.0, 52, 21, 11])
-        reconstruction.add_camera(camera)
-        if number == 1:
-            rig.add_ref_sensor(camera.sensor_id)
-        else:
-            rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d(offset))
-    reconstruction.add_rig(rig)
-    expected = {}
-    for step in range(4):
-        pose = np.concatenate([rotation(0.1 * step), [[step], [0.0], [5.0]]], axis=1)
-        frame = pycolmap.Frame(frame_id=step + 1, rig_id=1, rig_from_world=pycolmap.Rigid3d(pose))
-        images = []
-        for number in (1, 2):
-            name = f"{number}/{step}.png"
-            image = pycolmap.Image(name, np.zeros((5, 2)), camera_id=number, image_id=2 * step + number)
-            image.frame_id = step + 1
-            frame.add_data_id(image.data_id)
-            images.append(image)
-            whole = np.vstack([pose, [0, 0, 0, 1]])
-            expected[name] = whole if number == 1 else np.vstack([offset, [0, 0, 0, 1]]) @ whole
-            path = tmp_path / "images" / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.new("RGB", (40, 24)).save(path)
-        reconstruction.add_frame(frame)
-        for image in images:
-            reconstruction.add_image(image)
-    for step in range(4):
-        reconstruction.register_frame(step + 1)
-    for point in range(5):
-        track = pycolmap.Track([pycolmap.TrackElement(1, point), pycolmap.TrackElement(2, point)])
-        reconstruction.add_point3D(np.array([point, 1.0, 5.0]), track, np.zeros(3, dtype=np.uint8))
-    (tmp_path / "sparse/0").mkdir(parents=True)
-    reconstruction.write_binary(tmp_path / "sparse/0")
-    capture = read_colmap(tmp_path, *find_model(tmp_path))
-    assert set(capture.names) == set(expected)
-    for name, viewmat in zip(capture.names, capture.viewmats, strict=True):
-        np.testing.assert_allclose(viewmat, expected[name], atol=1e-9)
+    """Two cameras on one rig: an image's pose is by its frame and its camera's place, whatever images.txt says."""
+    camera = ("PINHOLE", 40, 24, [50.0, 52.0, 21.0, 11.0])
+    folder = write_capture(tmp_path / "cup", views=8, cameras=(camera, camera), suffix=".txt")
+    w, y = np.cos(0.15), np.sin(0.15)
+    (folder / "sparse/0/rigs.txt").write_text(f"# a rig\n7 2 CAMERA 1 CAMERA 2 1 {w} 0 {y} 0 1 0.5 0\n")
+    frames = "".join(
+        f"{step} 7 {np.cos(0.05 * step)} 0 {np.sin(0.05 * step)} 0 {step} 0 5 2 CAMERA 1 {2 * step + 1} CAMERA 2 "
+        f"{2 * step + 2}\n"
+        for step in range(4)
+    )
+    (folder / "sparse/0/frames.txt").write_text(frames)
+    capture = read_colmap(folder, *find_model(folder))
+    offset, pose = np.eye(4), np.eye(4)
+    offset[:3, :3], offset[:3, 3] = rotation(0.3), [1.0, 0.5, 0.0]
+    for view, viewmat in enumerate(capture.viewmats):
+        pose[:3, :3], pose[:3, 3] = rotation(0.1 * (view // 2)), [view // 2, 0.0, 5.0]
+        np.testing.assert_allclose(viewmat, offset @ pose if view % 2 else pose, atol=1e-9)
 
 
 @pytest.mark.parametrize("other", ["depth", "segmentation", "images_backup", "images_2"])

@@ -82,33 +82,6 @@ def test_mutated_models(capture, tmp_path, file, suffix):
     assert errors > (0.5 if suffix == ".bin" else 0.15) * cases
 
 
-@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
-def test_mutated_lenses(capture, tmp_path, model):
-    """Lenses of any numbers: a pinhole that the photo fills, or an error; the photos' size bounds the work."""
-    for path in (capture / "sparse/0").iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    reconstruction = pycolmap.Reconstruction(capture / "sparse/0")
-    lens = pycolmap.Camera.create_from_model_name(1, model, 30.0, 32, 24)
-    cameras = bytearray(struct.pack("<QIiQQ", 1, next(iter(reconstruction.cameras)), int(lens.model), 32, 24))
-    intact = bytes(cameras) + lens.params.tobytes()
-    choice, errors, target = random.Random(model), 0, tmp_path / "cameras.bin"
-    first = len(cameras)
-    for _ in range(40):
-        data = bytearray(intact)
-        place = choice.randrange(first, len(data), 8)
-        value = choice.choice(
-            [NAN, INF, HUGE, struct.pack("<d", choice.uniform(-2, 2) * 10 ** choice.randrange(-3, 9))]
-        )
-        data[place : place + 8] = value
-        target.write_bytes(data)
-        result = outcome_within(MEMORY, read_colmap, capture, tmp_path, ".bin")
-        if isinstance(result, InputError):
-            errors += 1
-        else:
-            assert np.isfinite(result.Ks).all() and (result.sizes >= 1).all() and (result.sizes <= 64).all()
-    assert 4 < errors < 40
-
-
 @pytest.mark.parametrize("file", FILES)
 @pytest.mark.parametrize("count", [2**31, 2**64 - 1])
 def test_counts_beyond_the_file(capture, tmp_path, file, count):
@@ -151,16 +124,12 @@ def test_bad_values(capture, tmp_path, file, place, replacement, words):
     [
         (b"element vertex 30", b"element vertex 1152921504606846976", "not a whole .ply file"),
         (b"element vertex 30", b"element vertex 31", "not a whole .ply file"),
-        (b"element vertex 30", b"element vertex 29", "not a whole .ply file"),
         (b"element vertex 30", b"element vertex -1", "not a whole .ply file"),
-        (b"element vertex 30", b"element vertex " + b"9" * 5000, "not a whole .ply file"),
         (b"property float x", b"property list uchar int x", "not a whole .ply file"),
-        (b"property float nx", b"property float x", "not a whole .ply file"),
         (b"property float nx", b"property float f_rest_9", "10 properties f_rest_"),
         (b"property float opacity", b"property float opacities", "lacks the properties opacity"),
         (b"end_header\n", b"", "it has no header"),
         (b"element vertex 30", b"element chunk 1\nelement vertex 30", "not a compressed .ply"),
-        (b"ply\n", b"", "not a .ply file"),
     ],
 )
 def test_bad_ply_headers(model_ply, tmp_path, old, new, words):
