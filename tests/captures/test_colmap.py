@@ -9,60 +9,13 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from helpers.captures import rotation, write_capture
 from helpers.refusals import assert_refused
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import find_model, read_colmap
 from turbogs_plugin.errors import InputError
-
-
-def rotation(angle: float) -> np.ndarray:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
-
-
-def write_capture(
-    folder: Path,
-    *,
-    views: int = 9,
-    cameras: tuple[tuple[str, int, int, list[float]], ...] = (("PINHOLE", 40, 24, [50.0, 52.0, 21.0, 11.0]),),
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    scale: float = 1.0,
-    model: str = "sparse/0",
-    suffix: str = ".bin",
-    nested: bool = False,
-    num_points: int = 20,
-) -> Path:
-    """A capture whose view i has camera ``i % len(cameras)`` at ``scale * (i, 0, -5) + shift``, turned a little, and
-    photos whose pixel (x, y) is (6x, 6y, 20i)."""
-    reconstruction = pycolmap.Reconstruction()
-    for number, (kind, width, height, params) in enumerate(cameras, start=1):
-        reconstruction.add_camera_with_trivial_rig(
-            pycolmap.Camera(camera_id=number, model=kind, width=width, height=height, params=params)
-        )
-    random = np.random.default_rng(0)
-    for view in range(views):
-        number = view % len(cameras)
-        name = (f"left/{view % 2}/" if nested else "") + f"photo{view:02d}.png"
-        turn = rotation(0.1 * view)
-        center = scale * np.array([view, 0.0, -5.0]) + shift
-        pose = pycolmap.Rigid3d(np.concatenate([turn, -(turn @ center)[:, None]], axis=1))
-        image = pycolmap.Image(name, np.zeros((num_points, 2)), camera_id=number + 1, image_id=view + 1)
-        reconstruction.add_image_with_trivial_frame(image, pose)
-        width, height = cameras[number][1:3]
-        x, y = np.meshgrid(np.arange(width), np.arange(height))
-        path = folder / "images" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pixels = np.stack([6 * x, 6 * y, np.full_like(x, 20 * view)], axis=-1).astype(np.uint8)
-        Image.fromarray(pixels).save(path)
-    for point in range(num_points):
-        track = pycolmap.Track([pycolmap.TrackElement(1, point), pycolmap.TrackElement(2, point)])
-        xyz = scale * random.normal(size=3) + shift
-        number = reconstruction.add_point3D(xyz, track, np.array([point, 2, 3], dtype=np.uint8))
-    (folder / model).mkdir(parents=True)
-    {".bin": reconstruction.write_binary, ".txt": reconstruction.write_text}[suffix](folder / model)
-    return folder
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
@@ -83,17 +36,6 @@ def test_reads_cameras_points_and_photos(tmp_path, model, suffix):
     image = scene.train.photos.image(3)
     assert image.shape == (24, 40, 3)
     np.testing.assert_allclose(image[5, 7] * 255, [42, 30, 80], atol=1e-4)
-
-
-def test_cameras_that_turn_on_the_spot_have_an_extent(tmp_path):
-    folder = write_capture(tmp_path / "cup", scale=1e-12, shift=(1.0, 0.0, 0.0))
-    model = pycolmap.Reconstruction(folder / "sparse/0")
-    for point in model.points3D.values():
-        point.xyz = [1.0, 0.0, 7.0]
-    model.write_binary(folder / "sparse/0")
-    scene = load_scene(folder)
-    assert scene.extent == 1.0
-    assert scene.frame.scale == pytest.approx(1.1 * 7.0)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])

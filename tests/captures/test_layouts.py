@@ -9,17 +9,11 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-import torch
 from helpers.painted import painted_photo, require_points_at_their_pixels
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.plan import make_plan
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.look import Look
-from turbogs_plugin.train.metrics import evaluate
-from turbogs_plugin.train.trainer import Trainer
 
 POINTS = np.array([[0.3, 0.0, 0.1], [-0.2, 0.25, -0.3], [0.0, -0.4, 0.35]])
 VIEWS = 9
@@ -151,19 +145,8 @@ def test_a_model_that_cannot_be_read_gives_way_to_other_poses_and_is_said(tmp_pa
     assert "transforms.json" in scene.notes[0] and scene.notes[1].startswith(f"not used: {said}")
 
 
-def test_scannetpp(tmp_path):
-    """The model as text in colmap, photos in resized_images."""
-    cameras = [pinhole(240, 160, 200.0)]
-    write_model(tmp_path / "dslr/colmap", cameras, NAMES, ".txt")
-    write_photos(tmp_path / "dslr/resized_images", cameras, NAMES)
-    scene = load_scene(tmp_path / "dslr")
-    require_painted(scene)
-    assert "photos in" in scene.notes[0] and "resized_images" in scene.notes[0]
-
-
 @pytest.mark.parametrize("kind", ["colmap", "transforms"])
 def test_one_camera_a_photo_upright_and_lying(tmp_path, kind):
-    """It trains, too: every view has another size."""
     sizes = [(96 + view, 64 - view) if view % 2 else (64 + view, 96 - view) for view in range(VIEWS)]
     cameras = [pinhole(*size, 80.0 + view) for view, size in enumerate(sizes)]
     write_photos(tmp_path / "room/images", cameras, NAMES)
@@ -174,13 +157,3 @@ def test_one_camera_a_photo_upright_and_lying(tmp_path, kind):
     scene = load_scene(tmp_path / "room")
     require_painted(scene)
     assert scene.train.cameras.sizes.tolist() == [list(size) for size in sizes[1:8]]
-    lengths = ("train.iterations=6", "train.refine_until=4", "schedule.max_views=3", "train.device=cpu")
-    asked = load_config("turbogs", lengths)
-    config = make_plan(asked, scene, torch.device("cpu")).apply(asked)
-    trainer = Trainer(config, scene, torch.device("cpu"))
-    trainer.initialise_maps()
-    before = trainer.maps.mean()
-    for _ in range(6):
-        trainer.step()
-    assert trainer.maps.mean() < before
-    assert np.isfinite(evaluate(trainer.gaussians, scene.test, Look(0, config.raster)).mean.psnr)

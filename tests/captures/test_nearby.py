@@ -18,15 +18,6 @@ def capture(tmp_path) -> Path:
     return tiny_capture(tmp_path / "far/from/others")
 
 
-def with_poses(folder: Path, name: str = "transforms.json") -> Path:
-    """A capture as others see it, with photos; what its file says is not read."""
-    (folder / "images").mkdir(parents=True)
-    for view in range(4):
-        Image.new("RGB", (8, 8)).save(folder / "images" / f"{view}.png")
-    (folder / name).write_text("{}")
-    return folder
-
-
 def refusal(path: Path) -> str:
     assert not holds_photos_alone(path)
     with pytest.raises(InputError) as refused:
@@ -34,14 +25,10 @@ def refusal(path: Path) -> str:
     return str(refused.value)
 
 
-@pytest.mark.parametrize("name", ["transforms.json", "transforms_train.json", "poses_bounds.npy"])
-def test_photos_of_a_capture(tmp_path, name):
-    capture = with_poses(tmp_path / "capture", name)
-    assert refusal(capture / "images") == f"{capture / 'images'} lies in the capture {capture}: give that folder"
-
-
 def test_photos_of_a_colmap_capture(capture, monkeypatch):
-    monkeypatch.chdir(capture / "images")
+    photos = capture / "images"
+    assert refusal(photos) == f"{photos} lies in the capture {capture}: give that folder"
+    monkeypatch.chdir(photos)
     assert refusal(Path()) == f". lies in the capture {capture}: give that folder"
 
 

@@ -124,12 +124,3 @@ def test_transparent_pixels_count_by_their_alpha():
 
 def test_points_that_no_photo_sees_are_grey():
     assert colors_in_photos(torch.tensor([[0.0, 50.0, 1.0]]), *two_views()).tolist() == [[128, 128, 128]]
-
-
-def test_no_more_photos_are_looked_at_than_say_anything_new():
-    """Of 100 photos of their own number, 32 evenly spread ones."""
-    cameras = Cameras(torch.eye(4).repeat(100, 1, 1), torch.eye(3).repeat(100, 1, 1), np.ones((100, 2), dtype=np.int64))
-    photos = Photos(torch.arange(100, dtype=torch.uint8)[:, None].repeat(1, 3), cameras.sizes)
-    views = np.linspace(0, 99, 32).round()
-    found = colors_in_photos(torch.tensor([[0.5, 0.5, 1.0]]), cameras, photos)
-    assert found[0, 0].item() == round(float(views.mean()))

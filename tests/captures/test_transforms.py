@@ -6,40 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.captures import TARGET, camera_to_world, write_transforms
 from helpers.refusals import assert_refused
-from PIL import Image
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.ply import read_colors
-
-TARGET = np.array([3.0, -1.0, 2.0])
-
-
-def camera_to_world(angle: float) -> np.ndarray:
-    """OpenGL's: x right, y up, z backward; on a ring of radius 4 about the target, looking at it, z up."""
-    center = TARGET + np.array([4 * math.cos(angle), 4 * math.sin(angle), 1.0])
-    backward = (center - TARGET) / np.linalg.norm(center - TARGET)
-    right = np.cross([0.0, 0.0, 1.0], backward)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(backward, right), backward, center], axis=1)
-    return pose
-
-
-def write_transforms(folder: Path, views: int = 9, mode: str = "RGB", **content) -> Path:
-    """Photos images/f0.png .. of 20x10, one colour each, and a transforms.json; a None in `content` drops it."""
-    (folder / "images").mkdir(parents=True)
-    frames = []
-    for view in range(views):
-        color = (10 * view, 200, 30, 128) if mode == "RGBA" else (10 * view, 200, 30)
-        Image.new(mode, (20, 10), color).save(folder / "images" / f"f{view}.png")
-        pose = np.round(camera_to_world(0.5 * view), 7).tolist()
-        frames.append({"file_path": f"./images/f{view}.png", "transform_matrix": pose})
-    everything = {"w": 20, "h": 10, "fl_x": 25.0, "fl_y": 26.0, "cx": 9.5, "cy": 5.5, "frames": frames} | content
-    kept = {key: value for key, value in everything.items() if value is not None}
-    (folder / "transforms.json").write_text(json.dumps(kept), encoding="utf-8-sig")  # with a mark at the beginning
-    return folder
 
 
 def edit(folder: Path, function) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from helpers.captures import write_capture, write_transforms
 from helpers.refusals import assert_refused
 from PIL import Image
 
@@ -80,35 +81,15 @@ def camera(model: str, params: list[float], width: int = WIDTH, height: int = HE
     return pycolmap.Camera(model=model, width=width, height=height, params=params, camera_id=1)
 
 
-def write_colmap(folder: Path, model: str, params: list[float], photo: np.ndarray, views: int = 4) -> Path:
-    reconstruction = pycolmap.Reconstruction()
-    reconstruction.add_camera_with_trivial_rig(camera(model, params))
-    (folder / "images").mkdir(parents=True)
-    for view in range(views):
-        pose = np.eye(3, 4)
-        pose[0, 3] = view
-        image = pycolmap.Image(f"{view}.png", np.zeros((5, 2)), camera_id=1, image_id=view + 1)
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-        Image.fromarray(photo).save(folder / "images" / f"{view}.png")
-    for point in range(5):
-        track = pycolmap.Track([pycolmap.TrackElement(1, point), pycolmap.TrackElement(2, point)])
-        reconstruction.add_point3D(np.array([point, 1.0, 5.0]), track, np.zeros(3, dtype=np.uint8))
-    (folder / "sparse" / "0").mkdir(parents=True)
-    reconstruction.write_binary(folder / "sparse" / "0")
+def with_photos(folder: Path, photo: np.ndarray) -> Path:
+    """The capture with this photo in the place of each."""
+    for path in (folder / "images").iterdir():
+        Image.fromarray(photo).save(path)
     return folder
 
 
-def write_transforms(folder: Path, photo: np.ndarray, views: int = 4, **content) -> Path:
-    (folder / "images").mkdir(parents=True)
-    frames = []
-    for view in range(views):
-        Image.fromarray(photo).save(folder / "images" / f"{view}.png")
-        pose = np.eye(4)
-        pose[0, 3] = view
-        frames.append({"file_path": f"images/{view}.png", "transform_matrix": pose.tolist()})
-    everything = {"w": WIDTH, "h": HEIGHT, "frames": frames} | content
-    (folder / "transforms.json").write_text(json.dumps(everything))
-    return folder
+def write_colmap(folder: Path, model: str, params: list[float], photo: np.ndarray) -> Path:
+    return with_photos(write_capture(folder, views=4, cameras=((model, WIDTH, HEIGHT, params),)), photo)
 
 
 def require_straight(scene, levels: float = 2.0) -> None:
@@ -131,7 +112,7 @@ def test_colmap_photos_are_those_of_a_pinhole(tmp_path, model):
     assert scene.notes[-1] == f"4 photos undistorted: {model} 320x240 -> PINHOLE {width}x{height}"
     # The pose is that of the capture: only the lens changed.
     np.testing.assert_allclose(
-        scene.frame.restore_points(scene.train.cameras.centers[0].numpy()), [-1, 0, 0], atol=1e-5
+        scene.frame.restore_points(scene.train.cameras.centers[0].numpy()), [1, 0, -5], atol=1e-5
     )
 
 
@@ -162,10 +143,10 @@ def test_transforms_photos_are_those_of_a_pinhole(tmp_path, content, model, para
     """Wherever the lens stands: for all frames, or in each."""
     numbers = opencv_content(content)
     photo = bent_photo(model, [260.0, 270.0, 163.0, 117.0, *params])
-    folder = write_transforms(tmp_path / "cup", photo, **numbers)
+    folder = with_photos(write_transforms(tmp_path / "cup", 4, w=WIDTH, h=HEIGHT, **numbers), photo)
     scene = load_scene(folder)
     require_straight(scene)
-    written = json.loads((folder / "transforms.json").read_text())
+    written = json.loads((folder / "transforms.json").read_text(encoding="utf-8-sig"))
     for key in numbers:
         del written[key]
     for frame in written["frames"]:
@@ -190,7 +171,7 @@ def test_reduced_photos_are_undistorted_in_full_size(tmp_path):
     (folder / "images_2").mkdir()
     for view in range(4):
         small = Image.fromarray(photo).resize((WIDTH // 2, HEIGHT // 2), Image.Resampling.BOX)
-        small.save(folder / "images_2" / f"{view}.png")
+        small.save(folder / "images_2" / f"photo{view:02d}.png")
     for whole in (True, False):
         scene = load_scene(folder, factor=2)
         assert (np.abs(scene.train.cameras.sizes - full.train.cameras.sizes / 2) <= 0.5).all()

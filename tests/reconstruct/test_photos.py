@@ -63,7 +63,7 @@ def test_photos_are_upright_for_everybody(suffix, tmp_path):
     place_photos(photos, tmp_path / "images")
     paths = [tmp_path / "images" / photo.name for photo in photos]
     sizes = photo_sizes(paths)
-    loaded = load_photos(paths, sizes, sizes, [None] * len(paths))
+    loaded = load_photos(paths, sizes, [None] * len(paths))
     for view, path in enumerate(paths):
         assert Image.open(path).getexif().get(0x0112, 1) == 1
         difference = loaded.image(view).numpy() * 255 - np.asarray(shown[path.name], dtype=np.float32)

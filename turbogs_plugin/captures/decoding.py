@@ -82,7 +82,6 @@ def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
 
 def load_photos(
     paths: Sequence[Path],
-    sizes: np.ndarray,
     targets: np.ndarray,
     lenses: Sequence[Lens | None],
     channels: int = 3,
@@ -94,7 +93,6 @@ def load_photos(
 
     Args:
         paths: V files.
-        sizes: [V, 2] int64 (width, height) that the files must have.
         targets: [V, 2] int64 (width, height) to give them.
         lenses: one a photo, None for a pinhole camera.
         channels: 3, where photos that are transparent lose their alpha and keep their colours as stored; or 4, where
@@ -102,8 +100,8 @@ def load_photos(
         progress: called with the number of photos decoded so far, and of all.
 
     Raises:
-        InputError: a photo that cannot be decoded, or is of another size (the first one in order is named); more photos
-            than fit in memory or on the disk.
+        InputError: a photo that cannot be decoded (the first one in order is named); more photos than fit in memory or
+            on the disk.
     """
     offsets = pixel_offsets(targets)
     colors = _room(targets, channels)
@@ -112,7 +110,7 @@ def load_photos(
     def load(view: int) -> bool:
         """Decode a photo; True where it is opaque."""
         target = tuple(targets[view].tolist())
-        photo = _decode(paths[view], tuple(sizes[view].tolist()), MODES[channels])
+        photo = _decode(paths[view], MODES[channels])
         lens = lenses[view]
         if lens is not None:
             photo = lens.undistort(photo)
@@ -143,14 +141,9 @@ def decoding_threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, min(MOST_THREADS, processor_cores())))
 
 
-def _decode(path: Path, size: tuple[int, int], mode: str) -> Image.Image:
-    """An image of exactly this size and mode, or `InputError`. The size is checked before any pixel is decoded."""
+def _decode(path: Path, mode: str) -> Image.Image:
+    """An image of exactly this mode, or `InputError`."""
     with opened_image(path) as image:
-        if image.size != size:
-            raise InputError(
-                f"photo {path} is {image.size[0]}x{image.size[1]} but its camera is {size[0]}x{size[1]}: "
-                "use the photos that the cameras were reconstructed from"
-            )
         if mode == "RGBa" or is_transparent(image):
             image = image.convert("RGBA")
         return image.convert(mode)

@@ -128,7 +128,7 @@ def _load_parts(
     views = np.concatenate(parts)
     paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
     channels = channels_of(paths) if capture.alpha == "opacity" else 3
-    photos = load_photos(paths, files.file_sizes[views], files.sizes[views], lenses, channels, progress)
+    photos = load_photos(paths, files.sizes[views], lenses, channels, progress)
     count = len(parts[0])
     first = int(photos.offsets[count])
     return [

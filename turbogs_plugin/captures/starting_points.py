@@ -64,8 +64,6 @@ def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
     extent = float(np.median(np.linalg.norm(centers - mean, axis=1)))
     if extent <= 1e-12 * np.abs(centers).max():  # all in one place but for rounding
         return 0.5, 10.0
-    if not np.isfinite(extent):
-        return extent, extent
     # Cameras of a rig stand in one place: the spacing is between places.
     rounded = np.round(((centers - mean) / (LEAST_SPACING * extent)).clip(-1e15, 1e15))
     places = torch.from_numpy(np.unique(rounded, axis=0))
