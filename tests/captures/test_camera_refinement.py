@@ -105,12 +105,6 @@ def test_training_photos_tell_how_far_the_camera_of_a_test_photo_may_be(tmp_path
     assert (refined.refined.Ks - refined.cameras.Ks).abs().max() < 0.4
 
 
-def test_photos_that_show_little_change_nothing(tmp_path):
-    scene = load_scene(write_tracked(tmp_path / "cup", tracked(points=20)))
-    refined = refine_cameras(scene)
-    assert unchanged(scene, refined, "train") and refined.points is scene.points and refined.notes == scene.notes
-
-
 @pytest.mark.parametrize("other", [True, False])
 def test_observations_of_other_photos_are_not_used(capture, other):
     """A reconstruction whose cameras were edited by hand for photos of another size, or that does not say any."""

@@ -19,10 +19,6 @@ def test_sizes_are_to_the_nearest_pixel(factor, expected):
     assert reduced_sizes(SIZES, factor).tolist() == np.asarray(expected).tolist()
 
 
-def test_photos_that_are_small_already_are_taken_as_they_are():
-    assert reduced_sizes(np.array([[3, 2]]), 1).tolist() == [[3, 2]]
-
-
 @pytest.mark.parametrize("factor", [26, 1000])
 def test_a_factor_that_leaves_next_to_nothing_is_refused(factor):
     with pytest.raises(InputError, match=rf"--factor {factor} .*500x90: the largest .* is 25$"):

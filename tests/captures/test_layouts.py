@@ -124,6 +124,9 @@ def test_nerfstudio_and_instant_ngp(tmp_path, model):
         scene = load_scene(tmp_path / "poster", factor)
         require_painted(scene)
         assert scene.train.cameras.sizes[0].tolist() == [240 // factor, 160 // factor] and len(scene.points) == 3
+        if not model:
+            assert scene.point_colors.tolist() == [[9, 8, 7]] * 3
+            np.testing.assert_allclose(scene.frame.restore_points(scene.points.numpy()), POINTS, atol=1e-6)
     assert ("transforms.json not used" in scene.notes) == bool(model)
 
 

@@ -10,7 +10,6 @@ from helpers.captures import TARGET, camera_to_world, write_transforms
 from helpers.refusals import assert_refused
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.ply import read_colors
 
 
@@ -35,28 +34,6 @@ def test_axes_intrinsics_and_photos(tmp_path):
         assert (viewmat[:3, :3] @ above + viewmat[:3, 3])[1] < -0.05
         assert np.linalg.det(viewmat[:3, :3]) == pytest.approx(1)
     assert scene.train.photos.colors[0].tolist() == [10, 200, 30]
-
-
-@pytest.mark.parametrize("body", ["ascii", "binary"])
-def test_points_from_a_ply(tmp_path, body):
-    folder = write_transforms(tmp_path / "cup", ply_file_path="sparse_pc.ply")
-    table = np.array(
-        [(1.5, 2, 3, 10, 20, 30), (4, 5, -6, 40, 50, 60)],
-        dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")],
-    )
-    kind = {"ascii": "ascii", "binary": "binary_little_endian"}[body]
-    header = f"ply\nformat {kind} 1.0\ncomment made by a test\nelement vertex 2\n"
-    header += "".join(f"property {kind} {name}\n" for kind, names in (("float", "xyz"),) for name in names)
-    header += "property uint8 red\nproperty uint8 green\nproperty uint8 blue\nend_header\n"
-    text = "\n".join(" ".join(str(value) for value in row) for row in table.tolist()).encode()
-    (folder / "sparse_pc.ply").write_bytes(header.encode() + (text if body == "ascii" else table.tobytes()))
-    scene = load_scene(folder)
-    np.testing.assert_allclose(scene.frame.restore_points(scene.points.numpy()), [[1.5, 2, 3], [4, 5, -6]], atol=1e-5)
-    assert scene.point_colors.tolist() == [[10, 20, 30], [40, 50, 60]]
-    if body == "ascii":
-        (folder / "sparse_pc.ply").write_bytes(header.encode() + text.replace(b"40", b"forty"))
-        with pytest.raises(InputError, match=r"sparse_pc\.ply is not a whole \.ply file"):
-            load_scene(folder)
 
 
 @pytest.mark.parametrize(
