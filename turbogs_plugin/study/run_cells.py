@@ -154,8 +154,7 @@ def _loaded(path: str, factor: int, test_every: int, refined: bool) -> tuple[Sce
     """Capture, its digest, and the seconds in which it was loaded. It stays for the next cells."""
     started = time.perf_counter()
     scene = load_scene(path, factor, test_every)
-    own = refine_cameras(scene, refined)
-    return own, capture_digest(scene), time.perf_counter() - started
+    return refine_cameras(scene, refined), capture_digest(scene), time.perf_counter() - started
 
 
 def _require_same_settings(study: Study, configs: dict[CellKey, Config]) -> None:

@@ -56,8 +56,7 @@ def open_scene(config: Config, folder: RunFolder | None = None, ranks: Ranks = O
             f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
             f"in {folder.config}"
         )
-    progress = show_loading if ranks.first else None
-    scene = load_scene(settings.path, settings.factor, settings.test_every, progress)
+    scene = load_scene(settings.path, settings.factor, settings.test_every, show_loading if ranks.first else None)
     cameras = find_cameras(scene, config.train.refine_cameras) if ranks.first else None
     return with_cameras(scene, ranks.agree(cameras))
 
