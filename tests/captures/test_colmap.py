@@ -50,15 +50,6 @@ def test_place_and_unit_of_the_capture_do_not_matter(tmp_path, scale):
     assert far.frame.scale == pytest.approx(scale * near.frame.scale, rel=tolerance)
 
 
-def test_factor_scales_intrinsics_by_the_actual_sizes(tmp_path):
-    cameras = (("PINHOLE", 42, 25, [50.0, 52.0, 21.0, 11.0]),)
-    scene = load_scene(write_capture(tmp_path / "cup", cameras=cameras), factor=4)
-    assert scene.train.cameras.sizes[0].tolist() == [11, 6]  # 10.5 and 6.25 to the nearest
-    expected = [[50 * 11 / 42, 0, 21 * 11 / 42], [0, 52 * 6 / 25, 11 * 6 / 25], [0, 0, 1]]
-    np.testing.assert_allclose(scene.train.cameras.Ks[0], expected, rtol=1e-6)
-    assert scene.train.photos.image(0).shape == (6, 11, 3)
-
-
 @pytest.mark.parametrize("case", ["used", "one is missing", "wrong size"])
 def test_reduced_copies_are_used_only_where_all_fit(tmp_path, case):
     folder = write_capture(tmp_path / "cup")
@@ -126,7 +117,6 @@ def test_bad_files_are_named(tmp_path, damage, words):
         ({}, {"test_every": 0}, "test_every is 0"),
         ({}, {"factor": 0}, "factor is 0"),
         ({}, {"factor": 2.5}, "factor is 2.5"),
-        ({"cameras": (("EQUIRECTANGULAR", 40, 24, [40, 24]),)}, {}, "camera 1 of .* is EQUIRECTANGULAR, a panorama"),
         ({"cameras": (("PINHOLE", 40, 24, [np.nan, 52.0, 21.0, 11.0]),)}, {}, "intrinsics|VerifyParams"),
     ],
 )

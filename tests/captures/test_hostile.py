@@ -82,17 +82,6 @@ def test_mutated_models(capture, tmp_path, file, suffix):
     assert errors > (0.5 if suffix == ".bin" else 0.15) * cases
 
 
-@pytest.mark.parametrize("file", FILES)
-@pytest.mark.parametrize("count", [2**31, 2**64 - 1])
-def test_counts_beyond_the_file(capture, tmp_path, file, count):
-    for path in (capture / "sparse/0").iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    target = tmp_path / f"{file}.bin"
-    target.write_bytes(struct.pack("<Q", count) + target.read_bytes()[8:])
-    error = outcome_within(MEMORY, read_colmap, capture, tmp_path, ".bin")
-    assert isinstance(error, InputError) and f"announces {count} records" in str(error)
-
-
 @pytest.mark.parametrize(
     ("file", "place", "replacement", "words"),
     [

@@ -120,7 +120,3 @@ def test_transparent_pixels_count_by_their_alpha():
     colors[3, :3] = torch.tensor([10, 20, 0])
     found = colors_in_photos(torch.tensor([[0.6, -0.4, 1.0]]), cameras, Photos(colors, photos.sizes))
     assert found.tolist() == [[90, 100, 80]]
-
-
-def test_points_that_no_photo_sees_are_grey():
-    assert colors_in_photos(torch.tensor([[0.0, 50.0, 1.0]]), *two_views()).tolist() == [[128, 128, 128]]

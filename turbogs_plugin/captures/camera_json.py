@@ -86,18 +86,17 @@ def read_camera(values: dict[str, Any], photo: Path, source: Path) -> tuple[np.n
     return (K, size, None) if lens is None else (lens.K, lens.size, lens)
 
 
-def pinhole(values: dict, source: Path, size: tuple[float, float], angles: str = "xy") -> np.ndarray | None:
+def pinhole(values: dict, source: Path, size: tuple[float, float]) -> np.ndarray | None:
     """[3, 3] float64 intrinsics of one frame; None where nothing gives its horizontal focal length.
 
     Args:
         values: the frame's own, before the file's for all frames.
         size: (width, height), in whose middle the principal point is unless it is given.
-        angles: axes whose ``camera_angle`` serves where there is no ``fl``.
     """
     focals: list[float | None] = []
     for axis, side in zip("xy", size, strict=True):
         focal = number_of(values, source, f"fl_{axis}")
-        angle = number_of(values, source, f"camera_angle_{axis}") if focal is None and axis in angles else None
+        angle = number_of(values, source, f"camera_angle_{axis}") if focal is None else None
         if angle is not None and 0 < angle < math.pi:
             focal = 0.5 * side / math.tan(0.5 * angle)
         focals.append(focals[0] if focal is None and focals else focal)

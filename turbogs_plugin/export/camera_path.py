@@ -98,7 +98,7 @@ def from_file(path: Path, frame: Frame, frames: int) -> Cameras:
     viewmats, Ks = [], []
     for place, entry in enumerate(entries):
         values = {**content, **entry}
-        K = pinhole(values, path, (width, height), angles="x")
+        K = pinhole(values, path, (width, height))
         if K is None or K[0, 0] <= 0:
             raise InputError(f"{path}: camera {place} has neither fl_x nor a camera_angle_x in 0 .. pi")
         Ks.append(K)
