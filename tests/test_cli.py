@@ -107,7 +107,7 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
     turbogs, capture, tmp_path, monkeypatch, out
 ):
     (tmp_path / "dangling").symlink_to("nowhere")
-    monkeypatch.setattr(inputs, "load_and_find", lambda *_, **__: pytest.fail("the capture was loaded"))
+    monkeypatch.setattr(inputs, "load_scene", lambda *_, **__: pytest.fail("the capture was loaded"))
     assert_refused(turbogs("train", capture, "--out", tmp_path / out, *QUICK), out, "cannot be made", "choose")
     assert [path.name for path in tmp_path.iterdir()] == ["dangling"]
 

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 import pytest
 import torch
@@ -17,15 +16,9 @@ def capture(tmp_path_factory):
     return write_demo_capture(tmp_path_factory.mktemp("demo") / "capture", views=12, width=80, height=60)
 
 
-def test_loads_like_any_capture(capture):
-    scene = load_scene(capture)
-    assert (len(scene.train), len(scene.test)) == (10, 2)
-    assert scene.train.photos.sizes.tolist() == [[80, 60]] * 10
-    assert len(scene.points) > 1000 and scene.extent == 1.0
-
-
 def test_points_lie_where_photos_have_their_colour(capture):
     scene = load_scene(capture)
+    assert (len(scene.train), len(scene.test)) == (10, 2) and len(scene.points) > 1000
     cameras = scene.train.cameras
     local = scene.points @ cameras.viewmats[4, :3, :3].T + cameras.viewmats[4, :3, 3]
     pixels = local @ cameras.Ks[4].T
@@ -73,11 +66,3 @@ def test_on_a_full_disk_it_is_refused_and_leaves_nothing(tmp_path, monkeypatch):
     words = f"'{tmp_path / 'capture'}' cannot be written whole: make room there"
     assert_refused(words, write_demo_capture, tmp_path / "capture", views=3, width=16, height=12)
     assert not list(tmp_path.iterdir())
-
-
-def test_edges_are_antialiased(capture):
-    """More than two levels between the black background and the table along its border."""
-    image = load_scene(capture).train.photos.image(0).sum(dim=2).numpy()
-    column = image[:, 40]
-    first = int(np.flatnonzero(column > 0)[0])
-    assert np.isin(image[first], [0.0]).any() and len(np.unique(image[first].round(3))) > 3

@@ -9,17 +9,11 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-import torch
 from helpers.painted import painted_photo, require_points_at_their_pixels
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.plan import make_plan
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.train.look import Look
-from turbogs_plugin.train.metrics import evaluate
-from turbogs_plugin.train.trainer import Trainer
 
 POINTS = np.array([[0.3, 0.0, 0.1], [-0.2, 0.25, -0.3], [0.0, -0.4, 0.35]])
 VIEWS = 9
@@ -117,33 +111,23 @@ def write_nerfstudio(folder: Path, cameras: list[pycolmap.Camera], names: list[s
     (folder / "sparse_pc.ply").write_text(header + "".join(f"{x} {y} {z} 9 8 7\n" for x, y, z in POINTS))
 
 
-@pytest.mark.parametrize("colmap", [True, False])
-def test_nerfstudio(tmp_path, colmap):
-    """images, images_2, ..., sparse_pc.ply and often COLMAP's own folder."""
+@pytest.mark.parametrize("model", ["colmap/sparse/0", "colmap_sparse/0", "colmap_text", ""])
+def test_nerfstudio_and_instant_ngp(tmp_path, model):
+    """images, images_2, ..., and often COLMAP's own folder, or one that colmap2nerf.py names."""
     camera, names = [pinhole(240, 160, 200.0)], [f"frame_{view + 1:05d}.png" for view in range(VIEWS)]
     write_nerfstudio(tmp_path / "poster", camera, [f"images/{name}" for name in names])
     write_photos(tmp_path / "poster/images", camera, names)
     write_photos(tmp_path / "poster/images_4", camera, names, 4)
-    if colmap:
-        write_model(tmp_path / "poster/colmap/sparse/0", camera, names)
+    if model:
+        write_model(tmp_path / "poster" / model, camera, names, ".txt" if "text" in model else ".bin")
     for factor in (1, 4):
         scene = load_scene(tmp_path / "poster", factor)
         require_painted(scene)
         assert scene.train.cameras.sizes[0].tolist() == [240 // factor, 160 // factor] and len(scene.points) == 3
-    assert ("transforms.json not used" in scene.notes) == colmap
-
-
-@pytest.mark.parametrize(("model", "suffix"), [("colmap_sparse/0", ".bin"), ("colmap_text", ".txt")])
-def test_instant_ngp(tmp_path, model, suffix):
-    """transforms.json without points, and COLMAP's model in folders of colmap2nerf.py's names."""
-    camera = [pinhole(240, 160, 200.0)]
-    write_nerfstudio(tmp_path / "fox", camera, [f"images/{name}" for name in NAMES])
-    write_photos(tmp_path / "fox/images", camera, NAMES)
-    write_model(tmp_path / "fox" / model, camera, NAMES, suffix)
-    scene = load_scene(tmp_path / "fox")
-    require_painted(scene)
-    assert f"COLMAP reconstruction {tmp_path / 'fox' / model} " in scene.notes[0] and len(scene.points) == 3
-    assert scene.notes[1:] == ("transforms.json not used",)
+        if not model:
+            assert scene.point_colors.tolist() == [[9, 8, 7]] * 3
+            np.testing.assert_allclose(scene.frame.restore_points(scene.points.numpy()), POINTS, atol=1e-6)
+    assert ("transforms.json not used" in scene.notes) == bool(model)
 
 
 @pytest.mark.parametrize("trouble", ["photos", "damaged", "incomplete"])
@@ -164,19 +148,8 @@ def test_a_model_that_cannot_be_read_gives_way_to_other_poses_and_is_said(tmp_pa
     assert "transforms.json" in scene.notes[0] and scene.notes[1].startswith(f"not used: {said}")
 
 
-def test_scannetpp(tmp_path):
-    """The model as text in colmap, photos in resized_images."""
-    cameras = [pinhole(240, 160, 200.0)]
-    write_model(tmp_path / "dslr/colmap", cameras, NAMES, ".txt")
-    write_photos(tmp_path / "dslr/resized_images", cameras, NAMES)
-    scene = load_scene(tmp_path / "dslr")
-    require_painted(scene)
-    assert "photos in" in scene.notes[0] and "resized_images" in scene.notes[0]
-
-
 @pytest.mark.parametrize("kind", ["colmap", "transforms"])
 def test_one_camera_a_photo_upright_and_lying(tmp_path, kind):
-    """It trains, too: every view has another size."""
     sizes = [(96 + view, 64 - view) if view % 2 else (64 + view, 96 - view) for view in range(VIEWS)]
     cameras = [pinhole(*size, 80.0 + view) for view, size in enumerate(sizes)]
     write_photos(tmp_path / "room/images", cameras, NAMES)
@@ -187,13 +160,3 @@ def test_one_camera_a_photo_upright_and_lying(tmp_path, kind):
     scene = load_scene(tmp_path / "room")
     require_painted(scene)
     assert scene.train.cameras.sizes.tolist() == [list(size) for size in sizes[1:8]]
-    lengths = ("train.iterations=6", "train.refine_until=4", "schedule.max_views=3", "train.device=cpu")
-    asked = load_config("turbogs", lengths)
-    config = make_plan(asked, scene, torch.device("cpu")).apply(asked)
-    trainer = Trainer(config, scene, torch.device("cpu"))
-    trainer.initialise_maps()
-    before = trainer.maps.mean()
-    for _ in range(6):
-        trainer.step()
-    assert trainer.maps.mean() < before
-    assert np.isfinite(evaluate(trainer.gaussians, scene.test, Look(0, config.raster)).mean.psnr)

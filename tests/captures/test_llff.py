@@ -2,7 +2,6 @@
 
 import io
 import math
-import random
 from pathlib import Path
 
 import numpy as np
@@ -143,7 +142,6 @@ def drop_photos(folder: Path) -> None:
         (set_at(2, 14, np.nan), "row 2 has no positive height, width and focal length"),
         (set_at(slice(None), 9, 0.0), "row 0 has no positive height"),
         (set_at(1, 15, 5e-324), "row 1 has .* bounds"),
-        (set_at(1, 16, 1.0), "row 1 has .* bounds"),
         (set_at(slice(None), 9, 60.0), "IMG_000.png is 120x80 but its camera is 60x80"),
     ],
 )
@@ -153,28 +151,13 @@ def test_what_is_refused(tmp_path, change, words):
     assert_refused(words, load_scene, folder)
 
 
-@pytest.mark.usefixtures("few_random_points")
 def test_damaged_files(tmp_path):
-    """Bytes changed or cut, a header that announces more than there is: refused in little memory, or finite numbers."""
-    folder = write_llff(tmp_path / "fern")
-    file = folder / "poses_bounds.npy"
-    content, choice, refused = file.read_bytes(), random.Random(0), 0
-    huge = io.BytesIO()
+    """A header that announces more than there is, an archive, a pickle, bytes cut: refused in little memory."""
+    file = write_llff(tmp_path / "fern") / "poses_bounds.npy"
+    content, huge, zipped = file.read_bytes(), io.BytesIO(), io.BytesIO()
     np.lib.format.write_array_header_1_0(huge, {"descr": "<f8", "fortran_order": False, "shape": (2**40, 17)})
-    zipped = io.BytesIO()
     np.savez(zipped, table())
-    hostile = [huge.getvalue() + content[128:], zipped.getvalue(), b"", b"\x80\x04", content[:60]]
-    for case in range(200):
-        data = bytearray(hostile[case] if case < len(hostile) else content)
-        if case >= len(hostile):
-            for _ in range(choice.choice([1, 2, 8])):
-                # Every second case goes for the header.
-                data[choice.randrange(128 if case % 2 else len(data))] = choice.randrange(256)
+    for data in (huge.getvalue() + content[128:], zipped.getvalue(), b"", b"\x80\x04", content[:60], content[:-1]):
         file.write_bytes(data)
-        result = outcome_within(2**25, load_scene, folder)
-        refused += isinstance(result, InputError)
-        if isinstance(result, InputError):
-            continue
-        assert case >= len(hostile)
-        assert result.train.cameras.viewmats.isfinite().all() and result.points.isfinite().all()
-    assert 50 < refused < 200
+        error = outcome_within(2**25, load_scene, file.parent)
+        assert isinstance(error, InputError) and "not a readable table" in str(error)

@@ -105,7 +105,7 @@ def write_tracked(
         path = folder / "images" / image.name
         path.parent.mkdir(parents=True, exist_ok=True)
         small = random.integers(0, 255, (HEIGHT // 16, WIDTH // 16, 3), dtype=np.uint8)
-        Image.fromarray(small).resize((WIDTH, HEIGHT)).save(path)
+        Image.fromarray(small).resize((WIDTH, HEIGHT), Image.Resampling.NEAREST).save(path)
     for point in range(count):
         shown_by = np.flatnonzero(case.observations.point_ids == point)
         elements = []

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from turbogs_plugin.engine.reference.projection import rotation_matrices
+from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.geometry import camera_centers, look_at, mean_neighbor_distances, quaternions, viewmat_of_pose
 
 
@@ -59,3 +60,9 @@ def test_neighbor_distances_are_exact(cloud):
     neighbors = min(3, len(points) - 1)
     expected = np.sort(distances, axis=1)[:, :neighbors].mean(axis=1)
     np.testing.assert_allclose(mean_neighbor_distances(torch.from_numpy(points), 3), expected, rtol=1e-12, atol=1e-14)
+
+
+def test_the_frame_of_cameras_that_turn_on_the_spot_is_by_the_points():
+    centers, points = np.full((4, 3), [1.0, 0.0, 0.0]) + 1e-12 * np.eye(4, 3), np.full((5, 3), [1.0, 0.0, 7.0])
+    assert Frame.around(centers, points).scale == pytest.approx(1.1 * 7.0)
+    assert Frame.around(centers + 4.0 * np.eye(4, 3), points).scale > 1.1

@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers.framework_runs import assert_identical, stop_after, tiny_config
 
-from turbogs_plugin.captures import decoding, load_scene
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan import facts
 from turbogs_plugin.scene import Scene, host_arrays
@@ -30,7 +30,7 @@ def little_memory(monkeypatch, tmp_path) -> Path:
     (tmp_path / "disk").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "disk"))
     monkeypatch.setattr(host_arrays.tempfile, "tempdir", None)
-    for module in (host_arrays, decoding, facts):
+    for module in (host_arrays, facts):
         monkeypatch.setattr(module, "free_host_bytes", lambda: HOST_MEMORY)
     return tmp_path / "disk"
 
@@ -132,15 +132,6 @@ def test_a_whole_run_streams_and_resumes_to_the_same_model(capture, little_memor
         assert_identical(states[0], state)
     models = [session.folder.model.read_bytes() for session in (whole, *resumed)]
     assert models[0] == models[1] == models[2]
-
-
-def test_fewer_photos_are_decoded_at_a_time_where_memory_is_short(monkeypatch):
-    monkeypatch.setattr(decoding, "processor_cores", lambda: 8)
-    monkeypatch.setattr(decoding, "free_host_bytes", lambda: 16 * 2**30)
-    largest = 8000 * 6000 * decoding.DECODING_BYTES
-    for size, threads in ((0, 8), (1920 * 1080 * decoding.DECODING_BYTES, 8), (largest, 3), (100 * largest, 1)):
-        with decoding.decoding_threads(size) as pool:
-            assert pool._max_workers == threads
 
 
 def test_photos_are_counted_while_they_are_decoded(capture):

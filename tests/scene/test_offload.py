@@ -14,7 +14,7 @@ from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.export.renders import render_run
 from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.scene import Scene, offload
-from turbogs_plugin.scene.offload import ABSENT, OffloadedErrorMaps, OffloadedPhotos, ViewWindow
+from turbogs_plugin.scene.offload import ABSENT, OffloadedErrorMaps, ViewWindow
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.train import run
@@ -119,15 +119,6 @@ def test_maps_of_both_kinds_say_the_same():
     assert_identical(both[0].state_dict(), both[1].state_dict())
 
 
-def test_photos_of_both_kinds_are_the_same():
-    colors = torch.randint(0, 256, (int(SIZES.prod(axis=1).sum()), 3), dtype=torch.uint8)
-    resident = Photos(colors, SIZES)
-    offloaded = OffloadedPhotos(resident, CPU)
-    assert offloaded.stored is colors and offloaded.to("cpu") is offloaded and len(offloaded) == len(SIZES)
-    for view in (4, 0, 6, 6, 2, 1, 3, 5):
-        assert torch.equal(resident.image(view), offloaded.image(view))
-
-
 class Machine:
     """A GPU's streams, simulated: of those that may go on, chance says which one does."""
 
@@ -201,7 +192,7 @@ def machine(monkeypatch):
 
 
 @pytest.mark.parametrize("written", [True, False])
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_no_copy_is_too_early_or_too_late(machine, seed, written):
     """Work on the window, and copies in and out, in any order that the events allow: what a plain array gives."""
     gpu, choose = machine(seed), random.Random(seed)

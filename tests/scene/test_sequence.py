@@ -18,6 +18,7 @@ def test_the_nearer_neighbour_weighs_more_and_all_photos_count():
 
 
 def test_a_photo_is_no_neighbour_of_itself():
+    assert neighbours([], ["1.jpg"]).weights.tolist() == [[0.0, 0.0]]
     near = neighbours(["1.png", "2.png", "3.png"], ["1.png", "2.png", "3.png"])
     assert near.rows.tolist() == [[0, 1], [0, 2], [1, 0]]
     assert near.weights.tolist() == [[0.0, 1.0], [0.5, 0.5], [1.0, 0.0]]
@@ -28,11 +29,6 @@ def test_each_folder_is_a_sequence_of_its_own():
     assert near.rows.tolist() == [[0, 1], [0, 2], [0, 0]]
     assert near.weights.tolist() == [[0.5, 0.5], [0.0, 1.0], [0.0, 0.0]]
     assert near.mean(torch.ones(3, 2)).tolist() == [[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]
-
-
-def test_nothing_known():
-    near = neighbours([], ["1.jpg"])
-    assert near.weights.tolist() == [[0.0, 0.0]]
 
 
 def test_neighbours_some_photos_apart():

@@ -83,7 +83,7 @@ def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
     config = run.RunFolder(finished).read_config()
     monkeypatch.setattr(run.RunFolder, "read_config", lambda folder: copy.deepcopy(config))
     scene = load_scene(config.scene.path)
-    monkeypatch.setattr(inputs, "load_and_find", lambda *_, **__: (scene, None))
+    monkeypatch.setattr(inputs, "load_scene", lambda *_, **__: scene)
     state = load_checkpoint(latest_checkpoint(finished / "checkpoints"))
     (tmp_path / "run").mkdir()
     shutil.copy(finished / "config.yaml", tmp_path / "run")

@@ -78,10 +78,9 @@ def frames(folder: str, count: int) -> list[dict]:
 
 LENS = {"w": 16, "h": 12, "fl_x": 14.0, "fl_y": 14.0, "cx": 8.0, "cy": 6.0}
 FILES = {
-    "brown": ("transforms.json", {**LENS, "k1": 0.05, "k2": -0.02, "k3": 0.01, "k4": 0.001, "p1": 0.001, "p2": 0.001}),
+    "brown": ("transforms.json", {**LENS, "k1": 0.05, "k2": -0.02, "k3": 0.01, "p1": 0.001, "p2": 0.001}),
     "fisheye": ("transforms.json", {**LENS, "camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": 0.01, "k3": 0.0}),
     "points": ("transforms.json", {**LENS, "ply_file_path": "points.ply"}),
-    "matrix": ("transforms.json", {"w": 16, "h": 12, "K": [[14.0, 0.0, 8.0], [0.0, 14.0, 6.0], [0.0, 0.0, 1.0]]}),
     "blender": ("transforms_train.json", {"camera_angle_x": 1.0}),
     "bent blender": ("transforms_train.json", {**LENS, "k1": 0.05, "p1": 0.001}),
 }

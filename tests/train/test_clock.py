@@ -105,7 +105,7 @@ def test_the_report_takes_the_last_evaluation(capture, tmp_path, monkeypatch):
 
 def test_cuda_that_is_absent_is_named_before_photos_are_read(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(run.torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(inputs, "load_and_find", lambda *_, **__: pytest.fail("photos were read"))
+    monkeypatch.setattr(inputs, "load_scene", lambda *_, **__: pytest.fail("photos were read"))
     with pytest.raises(InputError, match="CUDA was asked for and is absent"):
         run.train(tiny_config(capture, "train.device=cuda"), tmp_path / "run")
     assert not (tmp_path / "run").exists()
@@ -114,14 +114,14 @@ def test_cuda_that_is_absent_is_named_before_photos_are_read(capture, tmp_path, 
 def test_the_device_starts_and_processes_connect_while_photos_are_read(capture, tmp_path, monkeypatch):
     """Each waits for the other: neither would go on if one came after the other. On a CPU nothing is exchanged in the
     thread: gloo would mix it up with what the main thread exchanges meanwhile."""
-    together, met, load = threading.Barrier(2, timeout=60), [], inputs.load_and_find
+    together, met, load = threading.Barrier(2, timeout=60), [], inputs.load_scene
 
     class Noting(Ranks):
         def meet(self, device):
             met.append((device, threading.current_thread() is threading.main_thread()))
             together.wait()
 
-    monkeypatch.setattr(inputs, "load_and_find", lambda *a, **b: (together.wait(), load(*a, **b))[1])
+    monkeypatch.setattr(inputs, "load_scene", lambda *a, **b: (together.wait(), load(*a, **b))[1])
     device = torch.device("cpu")
     scene, started = inputs.open_started(tiny_config(capture), lambda: device, WallClock(), ranks=Noting())
     assert len(scene.train) == 7 and started == device and met == [(device, False)]

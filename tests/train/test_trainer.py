@@ -21,12 +21,12 @@ from helpers.processes import PRELOADED, ended
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.captures.fingerprint import capture_difference, capture_state
 from turbogs_plugin.config.configuration import Config, load_config, resolve
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.report.run_report import write_report
+from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.strategies.protocols import PixelSampler, SparseLoss
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint

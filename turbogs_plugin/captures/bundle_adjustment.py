@@ -49,8 +49,6 @@ DERIVATIVES = (
 `_Adjustment._camera_sums`, sign), in units of the focal length, and from function 6 on of the depth."""
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 """Rows and columns of the entries of a symmetric 3x3 matrix that are computed."""
-CHUNK = 30_000
-"""Observations at once: few large operations, whose results stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +193,6 @@ class _Adjustment:
         spread: [PARAMETERS, PARAMETERS], the prior's covariance of these.
         doubts: [V, PARAMETERS, PARAMETERS], the covariance of each camera's moves that is left by what the photo shows
             and the prior; zero where the photo shows too little to be refined.
-        entries: [9, O], room for what each observation adds to its point's normal equations.
         depths: [V], medians of the points before each camera.
         first_errors: [O] pixels, before the first step.
         scale: pixels, the median of these: errors far above it count little.
@@ -212,16 +209,8 @@ class _Adjustment:
         self.moves = np.zeros((views, PARAMETERS))
         self.spread = PRIOR**2 * np.eye(PARAMETERS) if spread is None else spread
         self.doubts = np.zeros((views, PARAMETERS, PARAMETERS))
-        self.entries = np.empty((9, len(self.point_ids)))
-        bounds = [0]  # of views together, so that a step has few large operations
-        for view in range(views):
-            if self.starts[view + 1] - self.starts[bounds[-1]] > CHUNK and view > bounds[-1]:
-                bounds.append(view)
-        self.chunks = list(zip(bounds, [*bounds[1:], views], strict=True))
-        seen = [self._seen(*chunk) for chunk in self.chunks]
-        depths = self._by_view(np.concatenate([sights[2] for sights, _, _ in seen]))
-        self.depths = np.array([np.median(part) if len(part) else 1.0 for part in depths])
-        self.first_errors = np.concatenate([errors for _, _, errors in seen])
+        sights, _, self.first_errors = self._seen()
+        self.depths = np.array([np.median(part) if len(part) else 1.0 for part in self._by_view(sights[2])])
         self.scale = max(_median(self.first_errors), FINEST)
 
     @property
@@ -232,30 +221,29 @@ class _Adjustment:
     def _by_view(self, values: np.ndarray) -> list[np.ndarray]:
         return np.split(values, self.starts[1:-1])
 
-    def _parts(self, first: int, last: int) -> Iterator[tuple[int, slice]]:
-        """Each of the views `first` to `last`, and the place of its observations among theirs."""
-        bounds = itertools.pairwise((self.starts[first : last + 1] - self.starts[first]).tolist())
-        return ((view, slice(*own)) for view, own in enumerate(bounds, first))
+    def _parts(self) -> Iterator[tuple[int, slice]]:
+        """Each view, and the place of its observations among all."""
+        return ((view, slice(*own)) for view, own in enumerate(itertools.pairwise(self.starts.tolist())))
 
-    def _seen(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The observations of views: x / z, y / z and z in the camera [3, n]; residuals [2, n]; their lengths [n],
-        infinite behind the camera."""
-        part, cameras = slice(self.starts[first], self.starts[last]), self.cameras
-        sights = np.take(self.places, self.point_ids[part], axis=1)
+    def _seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The observations: x / z, y / z and z in the camera [3, O]; residuals [2, O]; their lengths [O], infinite
+        behind the camera."""
+        cameras = self.cameras
+        sights = np.take(self.places, self.point_ids, axis=1)
         residuals = np.empty((2, sights.shape[1]))
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
-            for view, own in self._parts(first, last):
+            for view, own in self._parts():
                 sights[:, own] = cameras.rotations[view] @ sights[:, own] + cameras.translations[view][:, None]
                 sights[:2, own] /= sights[2, own]
                 residuals[:, own] = sights[:2, own] * cameras.focal[view][:, None] + cameras.centers[view][:, None]
-            np.subtract(self.pixels[:, part], residuals, out=residuals)
+            np.subtract(self.pixels, residuals, out=residuals)
             errors = np.sqrt((residuals * residuals).sum(axis=0))
         return sights, residuals, np.where((sights[2] > 0) & np.isfinite(errors), errors, math.inf)
 
-    def _counted(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The observations of views: x / z, y / z and 1 / z in the camera [3, n]; residuals [2, n]; Cauchy's weights
-        [n], in units of the noise. All are 0 where the error is infinite."""
-        sights, residuals, errors = self._seen(first, last)
+    def _counted(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The observations: x / z, y / z and 1 / z in the camera [3, O]; residuals [2, O]; Cauchy's weights [O], in
+        units of the noise. All are 0 where the error is infinite."""
+        sights, residuals, errors = self._seen()
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
             np.divide(1.0, sights[2], out=sights[2])
             weights = 1.0 / (self.scale**2 + errors * errors)
@@ -265,8 +253,7 @@ class _Adjustment:
 
     def move_cameras(self) -> None:
         """One step of every camera."""
-        sums = [self._camera_sums(*chunk) for chunk in self.chunks]
-        products, slopes = map(np.concatenate, zip(*sums, strict=True))
+        products, slopes = self._camera_sums()
         factors, prior = self._camera_factors(), np.linalg.inv(self.spread)  # [V, 2, PARAMETERS, 9]
         normals = (factors @ products[:, None] @ factors.swapaxes(2, 3)).sum(axis=1) + prior
         told = np.diff(self.starts) >= FEWEST_OBSERVATIONS
@@ -286,18 +273,18 @@ class _Adjustment:
             factors[:, axis, 8 + axis, 0] = self.cameras.half_widths
         return factors
 
-    def _camera_sums(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-        """[v, 9, 9], [v, 9, 2]: of each view, weighted sums of products of nine functions with each other and with the
+    def _camera_sums(self) -> tuple[np.ndarray, np.ndarray]:
+        """[V, 9, 9], [V, 9, 2]: of each view, weighted sums of products of nine functions with each other and with the
         residuals. The functions are 1, p, q, pp, pq, qq, 1 / z, p / z and q / z, where p is x / z and q is y / z."""
-        (p, q, near), residuals, weights = self._counted(first, last)
+        (p, q, near), residuals, weights = self._counted()
         roots = np.sqrt(weights)
         functions = np.stack([np.ones_like(p), p, q, p * p, p * q, q * q, near, near * p, near * q])
         functions *= roots
         residuals *= roots
-        products, slopes = np.empty((last - first, 9, 9)), np.empty((last - first, 9, 2))
-        for view, own in self._parts(first, last):
-            products[view - first] = functions[:, own] @ functions[:, own].T
-            slopes[view - first] = functions[:, own] @ residuals[:, own].T
+        products, slopes = np.empty((len(self.depths), 9, 9)), np.empty((len(self.depths), 9, 2))
+        for view, own in self._parts():
+            products[view] = functions[:, own] @ functions[:, own].T
+            slopes[view] = functions[:, own] @ residuals[:, own].T
         return products, slopes
 
     def learn_spread(self) -> None:
@@ -309,9 +296,7 @@ class _Adjustment:
 
     def move_points(self) -> None:
         """One step of every point that two photos show."""
-        factors, count, entries = self._point_factors(), self.places.shape[1], self.entries
-        for first, last in self.chunks:
-            entries[:, self.starts[first] : self.starts[last]] = self._point_entries(first, last, factors)
+        count, entries = self.places.shape[1], self._point_entries()
         seen = np.bincount(self.point_ids, entries[0] + entries[3] + entries[5] > 0, count)
         sums = np.stack([np.bincount(self.point_ids, values, count) for values in entries])  # [9, M]
         traces = sums[0] + sums[3] + sums[5]
@@ -334,27 +319,24 @@ class _Adjustment:
             factors[:, 6:, column + 6] = -focal * ahead
         return factors
 
-    def _point_entries(self, first: int, last: int, factors: np.ndarray) -> np.ndarray:
-        """[9, n]: what each observation adds to its point's normal equations; `factors` are `_point_factors`."""
-        (p, q, near), (across, down), weights = self._counted(first, last)
+    def _point_entries(self) -> np.ndarray:
+        """[9, O]: what each observation adds to its point's normal equations."""
+        factors = self._point_factors()
+        (p, q, near), (across, down), weights = self._counted()
         weights *= near
         across, down = across * weights, down * weights
         weights *= near
         functions = np.stack([weights, weights * p, weights * q, weights * p * p, weights * q * q, across, down,
                               across * p, down * q])  # fmt: skip
-        for view, own in self._parts(first, last):
+        for view, own in self._parts():
             functions[:, own] = factors[view] @ functions[:, own]
         return functions
 
     def agreeing_cameras(self) -> Pinholes:
         """The cameras; the given one where its photo agrees no better."""
-        pairs = zip(self._by_view(self.first_errors), self._by_view(self.errors()), strict=True)
+        pairs = zip(self._by_view(self.first_errors), self._by_view(self._seen()[2]), strict=True)
         better = np.array([len(new) > 0 and np.median(new) < np.median(old) for old, new in pairs])
         return self.cameras.where(better, self.given)
-
-    def errors(self) -> np.ndarray:
-        """[O] pixels between where points are seen and where photos show them; infinite behind a camera."""
-        return np.concatenate([self._seen(*chunk)[2] for chunk in self.chunks])
 
 
 def _solved(a, b, c, d, e, f, x, y, z) -> np.ndarray:

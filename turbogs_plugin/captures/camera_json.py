@@ -12,7 +12,7 @@ import numpy as np
 from turbogs_plugin.captures.capture import LARGEST_SIDE
 from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.captures.decoding import photo_size
-from turbogs_plugin.captures.undistort import Lens, brown_projection, lens_of_camera
+from turbogs_plugin.captures.undistort import Lens, lens_of_camera
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import viewmat_of_pose
 from turbogs_plugin.yaml_json import parse_json
@@ -20,10 +20,6 @@ from turbogs_plugin.yaml_json import parse_json
 BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 """Names of one model, whose missing coefficients are 0."""
 FISHEYE = "OPENCV_FISHEYE"
-MATRICES = ("K", "intrinsic_matrix")
-"""Keys of intrinsics as a matrix, of which NeuS2 writes the second."""
-LARGEST_SKEW = 0.5
-"""Largest entry [0, 1] of a matrix of intrinsics, in pixels, that counts as none: decompositions leave a small one."""
 
 
 def read_frames(source: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -49,14 +45,11 @@ def number_of(values: dict, source: Path, key: str, default: float | None = None
     return float(value)
 
 
-def read_camera(
-    values: dict, photo: Path, source: Path, lenses: dict[tuple, Lens]
-) -> tuple[np.ndarray, tuple[int, int], Lens | None]:
+def read_camera(values: dict[str, Any], photo: Path, source: Path) -> tuple[np.ndarray, tuple[int, int], Lens | None]:
     """[3, 3] float64 intrinsics, (width, height), and the lens where there is distortion, of one frame.
 
     Args:
         values: the frame's own, before the file's for all frames.
-        lenses: those already made, by their numbers; a new one is added.
     """
     number, owner = partial(number_of, values, source), f"{source}: the camera of {photo.name}"
     width, height = number("w"), number("h")
@@ -76,75 +69,41 @@ def read_camera(
             f"{owner} is a {str(model)[:40]!r}: known are {', '.join((*BROWN_MODELS, FISHEYE))}; convert the capture "
             "with ns-process-data, or use its COLMAP reconstruction"
         )
-    fisheye = model == FISHEYE
-    bends = tuple(number(key, 0.0) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    if unknown := [key for key in ("k5", "k6", *(("p1", "p2") if fisheye else ())) if number(key, 0.0)]:
+    bends = {key: number(key, 0.0) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
+    known = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "k3", "p1", "p2")
+    if unknown := [key for key, value in bends.items() if value and key not in known]:
         raise InputError(
             f"{owner} has {' and '.join(unknown)}, which {model} does not have: use the capture's COLMAP reconstruction"
         )
-    if not (fisheye or any(bends)):
+    if model != FISHEYE and not any(bends.values()):
         return K, size, None
-    key = (fisheye, size, *K.ravel().tolist(), *bends)
-    if key not in lenses:
-        lenses[key] = _make_lens(fisheye, size, K, bends, owner)
-    return lenses[key].K, lenses[key].size, lenses[key]
+    k1, k2, k3, k4, p1, p2 = (bends[key] for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    kind, coefficients = ("FULL_OPENCV", [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]) if k3 else ("OPENCV", [k1, k2, p1, p2])
+    if model == FISHEYE:
+        kind, coefficients = FISHEYE, [k1, k2, k3, k4]
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *coefficients]
+    lens = lens_of_camera(load_pycolmap().Camera(model=kind, width=size[0], height=size[1], params=params), owner)
+    return (K, size, None) if lens is None else (lens.K, lens.size, lens)
 
 
-def _make_lens(fisheye: bool, size: tuple[int, int], K: np.ndarray, bends: tuple[float, ...], owner: str) -> Lens:
-    """`bends`: k1, k2, k3, k4, p1, p2."""
-    k1, k2, k3, k4, p1, p2 = bends
-    pinhole = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    model, params = "OPENCV", [*pinhole, k1, k2, p1, p2]
-    if fisheye:
-        model, params = FISHEYE, [*pinhole, *bends[:4]]
-    elif k3 or k4:
-        model, params = "FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
-    camera = load_pycolmap().Camera(model=model, width=size[0], height=size[1], params=params)
-    # As nerfstudio has it: COLMAP's models, and OpenCV's own fourth coefficient, are other polynomials.
-    fourth = None if fisheye or not k4 else brown_projection(pinhole[:2], pinhole[2:], bends[:4], p1, p2)
-    return lens_of_camera(camera, owner, fourth)
-
-
-def pinhole(values: dict, source: Path, size: tuple[float, float], angles: str = "xy") -> np.ndarray | None:
+def pinhole(values: dict, source: Path, size: tuple[float, float]) -> np.ndarray | None:
     """[3, 3] float64 intrinsics of one frame; None where nothing gives its horizontal focal length.
-
-    Of `MATRICES` where there is neither ``fl_x`` nor an angle.
 
     Args:
         values: the frame's own, before the file's for all frames.
         size: (width, height), in whose middle the principal point is unless it is given.
-        angles: axes whose ``camera_angle`` serves where there is no ``fl``.
     """
     focals: list[float | None] = []
     for axis, side in zip("xy", size, strict=True):
         focal = number_of(values, source, f"fl_{axis}")
-        angle = number_of(values, source, f"camera_angle_{axis}") if focal is None and axis in angles else None
+        angle = number_of(values, source, f"camera_angle_{axis}") if focal is None else None
         if angle is not None and 0 < angle < math.pi:
             focal = 0.5 * side / math.tan(0.5 * angle)
         focals.append(focals[0] if focal is None and focals else focal)
     if focals[0] is None:
-        return next((_matrix(values, key, source) for key in MATRICES if key in values), None)
+        return None
     x, y = (number_of(values, source, f"c{axis}", 0.5 * side) for axis, side in zip("xy", size, strict=True))
     return np.array([[focals[0], 0.0, x], [0.0, focals[1], y], [0.0, 0.0, 1.0]])
-
-
-def _matrix(values: dict, key: str, source: Path) -> np.ndarray:
-    """[3, 3] float64 of a frame's intrinsics, which are the rows of a matrix, 3x3 or 4x4."""
-    try:
-        K = np.array(values[key], dtype=np.float64)
-    except (ValueError, TypeError, OverflowError):
-        K = np.empty(0)
-    rest = K.copy()
-    if fits := K.shape in ((3, 3), (4, 4)) and bool(np.isfinite(K).all()):
-        rest -= np.eye(len(K))
-        rest[[0, 1], [0, 1]] = rest[:2, 2] = 0.0
-        fits = bool((K[[0, 1], [0, 1]] > 0).all()) and abs(rest[0, 1]) <= LARGEST_SKEW
-    if not fits or np.abs(np.delete(rest, 1)).max() > 1e-6:
-        raise InputError(
-            f"{source}: {key} is {str(values[key])[:80]!r}: it must be finite numbers [[fx, 0, cx], [0, fy, cy], "
-            "[0, 0, 1]], with positive focal lengths fx and fy"
-        )
-    return np.array([[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
 
 
 def opengl_viewmat(matrix: Any, owner: str) -> np.ndarray:

@@ -33,7 +33,7 @@ class Capture:
         viewmats: [V, 4, 4] float64, world to camera (x right, y down, z forward).
         Ks: [V, 3, 3] float64, intrinsics of the full-size photos, undistorted where they have a lens.
         sizes: [V, 2] int64 (width, height) of the full-size photos, undistorted where they have a lens.
-        points: [M, 3] float64.
+        points: [M, 3] float64; M is 0 where `load_scene` is to draw them.
         point_colors: [M, 3] uint8; None: the points were drawn at random, and their colours are taken from the photos
             (`colors_in_photos`).
         lenses: one a view, None for a pinhole camera; given as empty where all are.
@@ -100,24 +100,6 @@ class Capture:
 def named(names: Sequence[str], most: int = 3) -> str:
     """The first of some names."""
     return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
-
-
-def absence_notes(scene: Path, source: Path, absent: Sequence[str], count: int) -> list[str]:
-    """A note where photos of the `count` images that a file names do not exist.
-
-    Args:
-        absent: names of the photos that do not exist.
-
-    Raises:
-        InputError: fewer than `FEWEST_PHOTOS` remain.
-    """
-    if absent and count - len(absent) < FEWEST_PHOTOS:
-        raise InputError(
-            f"{source} names {count} photos, of which {len(absent)} are missing in {scene} ({named(absent)}): at "
-            f"least {FEWEST_PHOTOS} are needed; copy the photos there"
-        )
-    note = f"{len(absent)} of {count} images are left out, their photos do not exist: {named(absent, most=1)}"
-    return [note] if absent else []
 
 
 def require_printable(name: str, source: Path) -> None:

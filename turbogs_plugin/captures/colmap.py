@@ -12,19 +12,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from turbogs_plugin.captures.capture import LARGEST_SIDE, Capture, absence_notes, named, require_printable
+from turbogs_plugin.captures.capture import LARGEST_SIDE, Capture, named, require_printable
 from turbogs_plugin.captures.colmap_files import (
     FILES,
     NO_POINT,
     SUFFIXES,
     ColmapModel,
     ModelImage,
-    count_images,
     read_model,
     read_poses,
 )
-from turbogs_plugin.captures.photo_files import IMAGES, common_folder, find_named
-from turbogs_plugin.captures.starting_points import starting_points
+from turbogs_plugin.captures.photo_files import IMAGES, find_named
 from turbogs_plugin.captures.undistort import Lens, lens_of_camera
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.scene import Observations
@@ -34,8 +32,6 @@ if TYPE_CHECKING:
 
 MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap", "colmap_sparse", "colmap_text", ".")
 """Folders of a scene's reconstructions, in order of preference; or numbered folders in them."""
-STRAIGHT_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Camera models that are a pinhole where all their parameters of distortion are 0."""
 
 
 def load_pycolmap() -> ModuleType:
@@ -53,14 +49,19 @@ def load_pycolmap() -> ModuleType:
 def find_model(scene: Path) -> tuple[Path, str] | None:
     """The scene's reconstruction and its suffix, '.bin' or '.txt'; None where there is none.
 
-    Of the several that COLMAP writes where photos did not connect (``sparse/0``, ``sparse/1``, ...), the one with most
-    images is taken. One that lacks files is taken where no other one is whole: `read_model` names them.
+    Of the several that COLMAP writes where photos did not connect (``sparse/0``, ``sparse/1``, ...), the one with the
+    largest file of images is taken. One that lacks files is taken where no other one is whole: `read_model` names them.
     """
     for needed in (FILES, FILES[:1], FILES[1:2]):
         for name in MODEL_FOLDERS:
             if models := _models_in(scene / name, needed):
-                return max(models, key=lambda model: count_images(model[0] / f"images{model[1]}"))  # first of equals
+                return max(models, key=lambda model: _images_bytes(*model))  # first of equals
     return None
+
+
+def _images_bytes(folder: Path, suffix: str) -> int:
+    file = folder / f"images{suffix}"
+    return file.stat().st_size if file.is_file() else 0
 
 
 def _models_in(place: Path, needed: Sequence[str]) -> list[tuple[Path, str]]:
@@ -74,7 +75,6 @@ def _models_in(place: Path, needed: Sequence[str]) -> list[tuple[Path, str]]:
 
 def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     """Read a reconstruction. Its photos are found by `find_named`; images whose photo does not exist are left out.
-    Without points, random ones are drawn.
 
     Args:
         scene: the scene's folder.
@@ -86,43 +86,33 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     """
     load_pycolmap()
     model = read_model(folder, suffix)
-    paths, moved = find_named(scene, [image.name for image in model.images], folder, (IMAGES, ""))
-    absent = [image.name for image, path in zip(model.images, paths, strict=True) if path is None]
-    absence = absence_notes(scene, folder, absent, len(model.images))
-    there = sorted((path, place) for place, path in enumerate(paths) if path is not None)
-    images = [model.images[place] for _, place in there]
-    photo_folder = common_folder(scene, [path for path, _ in there])
-    made: dict[tuple, Lens] = {}
-    lenses = {image.camera: _lens(model.cameras[image.camera], folder, made) for image in images}
+    found = find_named(scene, [image.name for image in model.images], folder, (IMAGES, ""))
+    images = [model.images[place] for place in found.places]
+    lenses = {image.camera: _lens(model.cameras[image.camera], folder) for image in images}
     poses = read_poses(folder, suffix, model)
     pairs = [(model.cameras[image.camera], lenses[image.camera]) for image in images]
     viewmats = np.array([poses[image.number] for image in images]).reshape(-1, 4, 4)
     Ks = np.array([camera.calibration_matrix() if lens is None else lens.K for camera, lens in pairs]).reshape(-1, 3, 3)
     sizes = np.array([(camera.width, camera.height) if lens is None else lens.size for camera, lens in pairs])
     sizes = sizes.reshape(-1, 2).astype(np.int64)
-    points, colors, shown = model.points["xyz"].copy(), model.points["color"].copy(), f"{len(model.points):,} points"
-    if drawn := not len(points) and bool(images):
-        points, how = starting_points(viewmats, Ks, sizes)
-        shown = f"no points, so {len(points):,} random ones {how}"
-    where = "" if photo_folder == scene / IMAGES else f", photos in {photo_folder}"
+    where = "" if found.folder == scene / IMAGES else f", photos in {found.folder}"
     kind = {".bin": "binary", ".txt": "text"}[suffix]
     return Capture(
-        names=tuple((scene / path).relative_to(photo_folder).as_posix() for path, _ in there),
-        photo_folder=photo_folder,
+        names=found.names,
+        photo_folder=found.folder,
         viewmats=viewmats,
         Ks=Ks,
         sizes=sizes,
-        points=points,
-        point_colors=None if drawn else colors,
+        points=model.points["xyz"].copy(),
+        point_colors=model.points["color"].copy(),
         lenses=tuple(lens for _, lens in pairs),
         notes=(
-            f"COLMAP reconstruction {folder} ({kind}): {len(images)} images, {shown}{where}",
+            f"COLMAP reconstruction {folder} ({kind}): {len(images)} images, {len(model.points):,} points{where}",
             *_choice_note(folder),
-            *moved,
-            *absence,
+            *found.notes,
         ),
         alpha="mask",
-        observations=None if drawn else _observations(model, images, lenses),
+        observations=_observations(model, images, lenses) if len(model.points) else None,
     ).checked(folder)
 
 
@@ -131,28 +121,15 @@ def _choice_note(model: Path) -> list[str]:
     models = _models_in(model.parent, FILES)
     if len(models) < 2 or model not in [folder for folder, _ in models]:
         return []
-    counts = [f"{folder.name} has {count_images(folder / f'images{suffix}')}" for folder, suffix in models]
-    return [
-        f"{len(models)} reconstructions in {model.parent}: {model.name} is taken for most images "
-        f"({named(counts, most=4)})"
-    ]
+    others = named([folder.name for folder, _ in models if folder != model])
+    return [f"{len(models)} reconstructions in {model.parent}: {model.name} is taken, the largest; {others} not used"]
 
 
-def _lens(camera: pycolmap.Camera, model: Path, made: dict[tuple, Lens]) -> Lens | None:
-    """The lens of a camera; None for a pinhole, and for an impossible size, which `Capture.checked` refuses.
-
-    Args:
-        made: the lenses so far, by their numbers; a new one is added.
-    """
-    name, size = camera.model.name, (camera.width, camera.height)
-    if name in ("PINHOLE", "SIMPLE_PINHOLE") or not 0 < max(size) <= LARGEST_SIDE:
+def _lens(camera: pycolmap.Camera, model: Path) -> Lens | None:
+    """The lens of a camera; None for a pinhole, and for an impossible size, which `Capture.checked` refuses."""
+    if max(camera.width, camera.height) > LARGEST_SIDE:
         return None
-    if name in STRAIGHT_MODELS and not camera.params[list(camera.extra_params_idxs())].any():
-        return None
-    key = (name, size, *camera.params.tolist())
-    if key not in made:
-        made[key] = lens_of_camera(camera, f"camera {camera.camera_id} of {model}")
-    return made[key]
+    return lens_of_camera(camera, f"camera {camera.camera_id} of {model}")
 
 
 def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict[int, Lens | None]) -> Observations:

@@ -28,6 +28,8 @@ POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error"
 """A point, without its track."""
 NO_POINT = np.uint64(2**64 - 1)
 TRACK_ELEMENT_BYTES = 8
+BITS = {"B": 8, "I": 32, "Q": 64}
+"""Bits of unsigned numbers, by their codes in the struct module."""
 SENSORS = {"CAMERA": 0, "IMU": 1}
 """Kinds of sensors of a rig."""
 SMALLEST_IMAGE, SMALLEST_CAMERA = 73, 24
@@ -91,18 +93,6 @@ def read_model(folder: Path, suffix: str) -> ColmapModel:
     return ColmapModel(model.cameras, model.images, model.points[np.argsort(model.points["id"], kind="stable")])
 
 
-def count_images(path: Path) -> int:
-    """Images that a file of images announces; damage is left to `read_model`."""
-    try:
-        if path.suffix == ".txt":
-            return sum(1 for _ in _pairs_of_lines(path))
-        with path.open("rb") as file:
-            announced = int.from_bytes(file.read(8), "little")
-        return min(announced, path.stat().st_size // SMALLEST_IMAGE)
-    except OSError:
-        return 0
-
-
 def read_poses(folder: Path, suffix: str, model: ColmapModel) -> dict[int, np.ndarray]:
     """[4, 4] float64 world to camera of each image, by its identifier.
 
@@ -164,7 +154,8 @@ class _Words:
         self.path, self.line, self.words = path, line, iter(words)
 
     def take(self, layout: str) -> tuple:
-        """The next numbers, by a layout of the struct module. Names of sensors and camera models count as numbers."""
+        """The next numbers, by a layout of the struct module, with ``w`` for a word. Names of sensors and camera models
+        count as numbers."""
         codes = (code for count, code in re.findall(r"(\d*)(\D)", layout) for code in code * int(count or 1))
         try:
             return tuple([_number(next(self.words), code) for code in codes])
@@ -172,13 +163,18 @@ class _Words:
             raise _damaged(self.path, f"line {self.line} lacks a number, or has another word in its place") from None
 
 
-def _number(word: str, code: str) -> float:
-    """Raises `ValueError` or `KeyError` where the word is none."""
+def _number(word: str, code: str) -> float | str:
+    """Raises `ValueError` or `KeyError` where the word is none of its code."""
+    if code in "wd":
+        return word if code == "w" else float(word)
     if code == "i" and word.isidentifier():
         import pycolmap
 
         return SENSORS[word] if word in SENSORS else int(pycolmap.CameraModelId.__members__[word])
-    return float(word) if code == "d" else int(word)
+    number = int(word)
+    if code in BITS and not 0 <= number < 1 << BITS[code]:
+        raise ValueError
+    return number
 
 
 class _Binary:
@@ -304,19 +300,11 @@ def _text_records(path: Path) -> Iterator[tuple[int, list[str]]]:
             yield number, words
 
 
-def _line_damaged(path: Path, number: int, what: str) -> InputError:
-    return _damaged(path, f"line {number} is not {what}")
-
-
 def _text_images(path: Path) -> Iterator[ModelImage]:
     for line, text, features in _pairs_of_lines(path):
         words = text.lstrip().split(" ", 9)  # the name is the rest, with its spaces
-        try:
-            number, pose, camera, name = int(words[0]), np.array(words[1:8], np.float64), int(words[8]), words[9]
-        except (ValueError, IndexError):
-            what = "an image: identifier, rotation (4 numbers), translation (3), camera and name"
-            raise _line_damaged(path, line, what) from None
-        yield ModelImage(number, camera, name, pose, _text_features(path, line + 1, features))
+        number, *pose, camera, name = _Words(path, line, words).take("I7dIw")
+        yield ModelImage(number, camera, name, np.array(pose), _text_features(path, line + 1, features))
 
 
 def _text_features(path: Path, line: int, text: str) -> np.ndarray:
@@ -327,19 +315,12 @@ def _text_features(path: Path, line: int, text: str) -> np.ndarray:
         points = [int(word) for word in words[2::3]]
         features["point"] = np.array([NO_POINT if point < 0 else point for point in points], np.uint64)
     except (ValueError, OverflowError):
-        raise _line_damaged(path, line, "the features of an image: x, y and point, again and again") from None
+        raise _damaged(path, f"line {line} is not x, y and point of features, again and again") from None
     features["pixel"] = numbers[:, :2]
     return features
 
 
 def _text_points(path: Path) -> np.ndarray:
-    points = []
-    for line, words in _text_records(path):
-        try:
-            xyz, color = tuple(map(float, words[1:4])), tuple(map(int, words[4:7]))
-            points.append((int(words[0]), xyz, color, float(words[7])))
-            np.array(points[-1:], POINT)
-        except (ValueError, IndexError, OverflowError):
-            what = "a point: identifier, x, y, z, red, green, blue (0 .. 255), error and track"
-            raise _line_damaged(path, line, what) from None
+    records = (_Words(path, line, words).take("Q3d3Bd") for line, words in _text_records(path))
+    points = [(number, (x, y, z), (red, green, blue), error) for number, x, y, z, red, green, blue, error in records]
     return np.array(points, POINT)

@@ -15,33 +15,17 @@ from torch import Tensor
 from turbogs_plugin.captures.undistort import Lens
 from turbogs_plugin.device import processor_cores
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.host_arrays import free_host_bytes, host_array
+from turbogs_plugin.scene.host_arrays import host_array
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 
 MODES = {3: "RGB", 4: "RGBa"}
 """Pillow's modes, by channels; the latter's colours are multiplied by alpha."""
-AS_STORED = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_90,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_270,
-}
-"""Turn from an upright picture to the one that a file of an EXIF orientation stores; none for other orientations."""
 SMALLEST_SIDE = 4
 """The shorter side of a reduced photo has at least this many pixels; of fewer, nothing is left to see."""
 OPAQUE_SUFFIXES = (".jpg", ".jpeg")
 """Suffixes of formats without alpha, whose headers need not be read again."""
-DECODING_BYTES = 24
-"""Bytes of a pixel while its photo is decoded, undistorted and reduced: several copies, one of them in float32."""
-MEMORY_SHARE = 0.25
-"""Photos that are being decoded may take this share of the free memory, with one thread more if need be."""
 MOST_THREADS = 16
-"""Photos are decoded by a thread a processor, but by no more than this."""
-SMALL_WORK = 2**30
-"""Bytes that are not worth a question."""
+"""Photos that are decoded at a time; undistorted and reduced, each takes up to 24 bytes a pixel."""
 
 
 def reduced_sizes(sizes: np.ndarray, factor: float) -> np.ndarray:
@@ -96,23 +80,12 @@ def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
         return np.array(list(pool.map(photo_size, paths)), dtype=np.int64).reshape(-1, 2)
 
 
-def photo_array(sizes: np.ndarray, channels: int = 3) -> Tensor:
-    """[X, channels] uint8 for photos of these `sizes` [V, 2], with any content, where there is room (`host_array`).
-
-    Raises:
-        InputError: more photos than fit in memory or on the disk.
-    """
-    return host_array((int(pixel_offsets(sizes)[-1]), channels), torch.uint8, f"{len(sizes)} photos")
-
-
 def load_photos(
     paths: Sequence[Path],
-    sizes: np.ndarray,
     targets: np.ndarray,
     lenses: Sequence[Lens | None],
-    colors: Tensor,
-    loaded: Callable[[], object],
-    meanwhile: Callable[[], object] | None = None,
+    channels: int = 3,
+    progress: Callable[[int, int], object] | None = None,
 ) -> Photos:
     """Decode photos in parallel, undistorted, then reduced to their target sizes by area averaging.
 
@@ -120,70 +93,57 @@ def load_photos(
 
     Args:
         paths: V files.
-        sizes: [V, 2] int64 (width, height) that the files must have.
         targets: [V, 2] int64 (width, height) to give them.
         lenses: one a photo, None for a pinhole camera.
-        colors: where to put them, as `photo_array` gives it. With 3 channels, photos that are transparent lose their
-            alpha and keep their colours as stored.
-        loaded: called after each photo, by several threads.
-        meanwhile: called once, while photos are decoded.
+        channels: 3, where photos that are transparent lose their alpha and keep their colours as stored; or 4, where
+            3 are kept after all if every pixel is opaque.
+        progress: called with the number of photos decoded so far, and of all.
 
     Raises:
-        InputError: a photo that cannot be decoded, or is of another size (the first one in order is named); no room
-            for a copy of photos that are all opaque.
+        InputError: a photo that cannot be decoded (the first one in order is named); more photos than fit in memory or
+            on the disk.
     """
     offsets = pixel_offsets(targets)
-    channels = colors.shape[1]
+    colors = _room(targets, channels)
     pixels = colors.numpy()
 
     def load(view: int) -> bool:
         """Decode a photo; True where it is opaque."""
         target = tuple(targets[view].tolist())
-        photo = _decode(paths[view], tuple(sizes[view].tolist()), MODES[channels])
+        photo = _decode(paths[view], MODES[channels])
         lens = lenses[view]
         if lens is not None:
-            size = lens.size_of(photo.size)
-            photo = Image.frombytes(photo.mode, size, lens.undistort(np.asarray(photo), size).tobytes())
+            photo = lens.undistort(photo)
         if photo.size != target:
             photo = photo.resize(target, Image.Resampling.BOX)
         pixels[offsets[view] : offsets[view + 1]] = (values := np.asarray(photo)).reshape(-1, channels)
-        loaded()
         return channels == 3 or bool((values[..., 3] == 255).all())
 
-    largest = int(sizes.prod(axis=1).max(initial=1))
-    opaque = channels == 4
-    with decoding_threads(DECODING_BYTES * largest) as pool:
-        decoded = [pool.submit(load, view) for view in range(len(paths))]
-        try:
-            if meanwhile is not None:
-                meanwhile()
-            opaque &= all([photo.result() for photo in decoded])  # the first error in order is raised
-        finally:
-            pool.shutdown(cancel_futures=True)
-    if opaque:  # after all
-        colors = photo_array(targets).copy_(colors[:, :3])
+    opaque = True
+    with decoding_threads() as pool:
+        # The first error in order is raised, and ends what was not begun.
+        for count, own in enumerate(pool.map(load, range(len(paths))), start=1):
+            opaque &= own
+            if progress is not None:
+                progress(count, len(paths))
+    if opaque and channels == 4:
+        colors = _room(targets, 3).copy_(colors[:, :3])
     return Photos(colors, targets)
 
 
-def decoding_threads(bytes_each: int = 0) -> ThreadPoolExecutor:
-    """Threads to decode photos: one a processor of this process, but no more than `MEMORY_SHARE` of free memory allows.
-
-    Args:
-        bytes_each: memory that one thread takes.
-    """
-    wanted = min(MOST_THREADS, processor_cores())
-    affordable = int(MEMORY_SHARE * free_host_bytes()) // bytes_each if wanted * bytes_each > SMALL_WORK else wanted
-    return ThreadPoolExecutor(max(1, min(wanted, affordable)))
+def _room(sizes: np.ndarray, channels: int) -> Tensor:
+    """[X, channels] uint8 for photos of these `sizes` [V, 2], with any content."""
+    return host_array((int(pixel_offsets(sizes)[-1]), channels), torch.uint8, f"{len(sizes)} photos")
 
 
-def _decode(path: Path, size: tuple[int, int], mode: str) -> Image.Image:
-    """An image of exactly this size and mode, or `InputError`. The size is checked before any pixel is decoded."""
+def decoding_threads() -> ThreadPoolExecutor:
+    """Threads to decode photos: one a processor of this process, at most `MOST_THREADS`."""
+    return ThreadPoolExecutor(max(1, min(MOST_THREADS, processor_cores())))
+
+
+def _decode(path: Path, mode: str) -> Image.Image:
+    """An image of exactly this mode, or `InputError`."""
     with opened_image(path) as image:
-        if image.size != size:
-            raise InputError(
-                f"photo {path} is {image.size[0]}x{image.size[1]} but its camera is {size[0]}x{size[1]}: "
-                "use the photos that the cameras were reconstructed from"
-            )
         if mode == "RGBa" or is_transparent(image):
             image = image.convert("RGBA")
         return image.convert(mode)
@@ -191,10 +151,16 @@ def _decode(path: Path, size: tuple[int, int], mode: str) -> Image.Image:
 
 @contextmanager
 def opened_image(path: Path, what: str = "photo", remedy: str = "copy it there again") -> Iterator[Image.Image]:
-    """The file with its header read, as stored; `InputError` for whatever goes wrong with it while entered."""
+    """The file with its header read, as stored; `InputError` for whatever goes wrong with it while entered, and for a
+    TIFF that Pillow would turn, as it turns no other kind: cameras are by the pixels as they are stored."""
     try:
         with Image.open(path) as image:
-            yield _as_stored(image)
+            if image.format == "TIFF" and image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
+                raise InputError(
+                    f"{what} {path} is a TIFF with an orientation in its EXIF data: take that out, or save it upright "
+                    "before cameras are found"
+                )
+            yield image
     except InputError:
         raise
     except Exception as error:  # a broken file can raise anything in its decoder
@@ -202,17 +168,3 @@ def opened_image(path: Path, what: str = "photo", remedy: str = "copy it there a
         if isinstance(error, UnidentifiedImageError):
             reason = "it is no image of a known kind" if path.stat().st_size else "the file is empty"
         raise InputError(f"cannot read the {what} {path}: {reason}; {remedy}") from error
-
-
-def _as_stored(image: Image.Image) -> Image.Image:
-    """The image as COLMAP reads it: Pillow turns TIFFs, and them alone, as their orientation says."""
-    if image.format != "TIFF":
-        return image
-    exif = image.getexif()
-    orientation = exif.get(ExifTags.Base.Orientation)
-    if orientation not in AS_STORED:
-        return image
-    stored = image.transpose(AS_STORED[orientation])  # decodes it, and so takes the orientation out of its EXIF data
-    exif[ExifTags.Base.Orientation] = orientation
-    stored.format, stored._exif = image.format, exif  # which a transposed image has not
-    return stored

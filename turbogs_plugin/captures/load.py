@@ -2,37 +2,31 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Lock
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture
-from turbogs_plugin.captures.decoding import channels_of, load_photos, photo_array, photo_sizes, reduced_sizes
+from turbogs_plugin.captures.decoding import channels_of, load_photos, photo_sizes, reduced_sizes
 from turbogs_plugin.captures.kinds import read_capture
 from turbogs_plugin.captures.mask_files import find_masks, load_masks
 from turbogs_plugin.captures.photo_files import IMAGES
-from turbogs_plugin.captures.starting_points import colors_in_photos
+from turbogs_plugin.captures.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.captures.undistort import undistortion_note
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks, ViewMask
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.geometry import camera_centers
 from turbogs_plugin.scene.host_arrays import file_note
-from turbogs_plugin.scene.scene import PosedImages, PosedViews, Scene
+from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.scene.scene import PosedImages, Scene
 from turbogs_plugin.types import Cameras
 
-MOST_PIXELS = 1 << 28
-"""Pixels of a photo as it is trained on. Where tiles are drawn whole, a draw tells 2^20 of a view apart (`RANK_BITS` of
-engine/reference/draws.py)."""
 FARTHEST = 1e15
 """Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
 
@@ -59,7 +53,6 @@ def load_scene(
     factor: int = 1,
     test_every: int = 8,
     progress: Callable[[int, int], object] | None = None,
-    meanwhile: Callable[[PosedViews, PosedViews, Tensor], object] | None = None,
 ) -> Scene:
     """Load a capture with its photos.
 
@@ -75,8 +68,7 @@ def load_scene(
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
             Captures with a split of their own (NeRF-synthetic, lists in a ``transforms.json``) keep it.
-        progress: called with the number of photos decoded so far, and of all, by one thread at a time.
-        meanwhile: called once, while photos are decoded, with training views, test views and the scene's points.
+        progress: called with the number of photos decoded so far, and of all.
 
     Raises:
         InputError: anything wrong with the scene or the arguments, in one line.
@@ -86,33 +78,23 @@ def load_scene(
         if not isinstance(number, int) or number < 1:
             raise InputError(f"{name} is {number}: it must be an integer of at least 1")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
-        capture = read_capture(scene)
+        capture = _with_points(read_capture(scene))
     test = _test_views(scene, capture, test_every)
     frame, viewmats, points = _normalised(scene, capture, test)
     files = _find_photos(scene, capture, factor)
     mask_files, mask_note = find_masks(scene, capture, files.paths)
     masks = load_masks(mask_files, files.paths, capture, files.file_sizes, files.sizes)
     seen = np.array([mask is None or mask.pixels > 0 for mask in masks])
-    for name, part in (("training", ~test), ("test", test)):
-        if not (part & seen).any():
+    parts = [np.flatnonzero(part & seen) for part in (~test, test)]
+    for name, part, views in zip(("training", "test"), (~test, test), parts, strict=True):
+        if not len(views):
             raise InputError(
                 f"{scene}: all {part.sum()} {name} photos are masked whole: zero in a mask, or in "
                 "the alpha of a photo, is masked; mend the masks, or take them away"
             )
-    parts = [np.flatnonzero(part & seen) for part in (~test, test)]
-    posed = [_posed(capture, viewmats, files.sizes, views) for views in parts]
-    colors = [_room(capture, files, views) for views in parts]  # before minutes go into photos that have none
-    counter, one_at_a_time = itertools.count(1), Lock()
-
-    def loaded() -> None:
-        with one_at_a_time:
-            if progress is not None:
-                progress(next(counter), int(seen.sum()))
-
-    works = (None if meanwhile is None else partial(meanwhile, posed[0], posed[1], points), None)
     train, tested = (
-        _load_views(capture, files, views, masks, posed_views, room, loaded, work)
-        for views, posed_views, room, work in zip(parts, posed, colors, works, strict=True)
+        _posed(capture, viewmats, files.sizes, masks, views, photos)
+        for views, photos in zip(parts, _load_parts(capture, files, parts, progress), strict=True)
     )
     if capture.point_colors is None:
         point_colors = colors_in_photos(points, train.cameras, train.photos, train.masks)
@@ -137,6 +119,53 @@ def load_scene(
         drawn_points=capture.point_colors is None,
         notes=tuple(filter(None, (*capture.notes, *notes))),
     )
+
+
+def _load_parts(
+    capture: Capture, files: PhotoFiles, parts: list[np.ndarray], progress: Callable[[int, int], object] | None
+) -> list[Photos]:
+    """The photos of the training views and of the test views, `parts`, in one array: its room is found at once."""
+    views = np.concatenate(parts)
+    paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
+    channels = channels_of(paths) if capture.alpha == "opacity" else 3
+    photos = load_photos(paths, files.sizes[views], lenses, channels, progress)
+    count = len(parts[0])
+    first = int(photos.offsets[count])
+    return [
+        Photos(photos.colors[:first], photos.sizes[:count]),
+        Photos(photos.colors[first:], photos.sizes[count:]),
+    ]
+
+
+def _posed(
+    capture: Capture,
+    viewmats: Tensor,
+    sizes: np.ndarray,
+    masks: list[ViewMask | None],
+    views: np.ndarray,
+    photos: Photos,
+) -> PosedImages:
+    """Some views with their photos, cameras for photos of these `sizes` [V, 2], masks and what the photos show."""
+    ratios = sizes / capture.sizes  # [V, 2]
+    intrinsics = capture.Ks.copy()
+    intrinsics[:, :2] *= ratios[:, :, None]
+    cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
+    shown = None if capture.observations is None else capture.observations.of_views(views, ratios[views])
+    own, masked = [masks[view] for view in views], None
+    if any(mask is not None for mask in own):
+        pairs = zip(own, sizes[views, ::-1].tolist(), strict=True)  # (height, width)
+        masked = PixelMasks.of_views([mask or ViewMask.of(np.ones(size, dtype=bool)) for mask, size in pairs])
+    return PosedImages(cameras, tuple(capture.names[view] for view in views), photos, masked, shown)
+
+
+def _with_points(capture: Capture) -> Capture:
+    """The capture, with points drawn about what its training cameras look at where it has none."""
+    if len(capture.points):
+        return capture
+    train = slice(None) if capture.test is None or capture.test.all() else ~capture.test
+    points, how = starting_points(capture.viewmats[train], capture.Ks[train], capture.sizes[train])
+    note = f"{len(points):,} random points are drawn {how}, as the capture has none"
+    return replace(capture, points=points, point_colors=None, notes=(*capture.notes, note))
 
 
 def _test_views(scene: Path, capture: Capture, test_every: int) -> np.ndarray:
@@ -166,42 +195,6 @@ def _normalised(scene: Path, capture: Capture, test: np.ndarray) -> tuple[Frame,
     return frame, viewmats, points
 
 
-def _posed(capture: Capture, viewmats: Tensor, sizes: np.ndarray, views: np.ndarray) -> PosedViews:
-    """Some views' cameras for photos of these `sizes` [V, 2], and what the photos show."""
-    ratios = sizes / capture.sizes  # [V, 2]
-    intrinsics = capture.Ks.copy()
-    intrinsics[:, :2] *= ratios[:, :, None]
-    cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
-    shown = None if capture.observations is None else capture.observations.of_views(views, ratios[views])
-    return PosedViews(cameras, shown)
-
-
-def _room(capture: Capture, files: PhotoFiles, views: np.ndarray) -> Tensor:
-    """Room for the photos of some views, with alpha where that is opacity."""
-    channels = channels_of([files.paths[view] for view in views]) if capture.alpha == "opacity" else 3
-    return photo_array(files.sizes[views], channels)
-
-
-def _load_views(
-    capture: Capture,
-    files: PhotoFiles,
-    views: np.ndarray,
-    masks: list[ViewMask | None],
-    posed: PosedViews,
-    colors: Tensor,
-    loaded: Callable[[], object],
-    meanwhile: Callable[[], object] | None,
-) -> PosedImages:
-    """Some views with their photos, decoded into `colors`; the last two arguments are for `load_photos`."""
-    paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
-    sizes, own, masked = files.sizes[views], [masks[view] for view in views], None
-    photos = load_photos(paths, files.file_sizes[views], sizes, lenses, colors, loaded, meanwhile)
-    if any(mask is not None for mask in own):
-        pairs = zip(own, sizes[:, ::-1].tolist(), strict=True)  # (height, width)
-        masked = PixelMasks.of_views([mask or ViewMask.of(np.ones(size, dtype=bool)) for mask, size in pairs])
-    return PosedImages(posed.cameras, tuple(capture.names[v] for v in views), photos, masked, posed.observations)
-
-
 def _masked_note(names: tuple[str, ...], masks: list[ViewMask | None], sizes: np.ndarray, seen: np.ndarray) -> str:
     """One line on masked pixels and on views left out for them; empty where nothing is masked."""
     pixels = {view: mask.pixels for view, mask in enumerate(masks) if mask is not None}
@@ -217,35 +210,29 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
     """The files to read where photos are to be reduced by `factor`: copies in ``images_<factor>`` where all are there
     in the right size, else the capture's photos. Photos of ``images_4`` that are smaller than their cameras by that are
     reduced already."""
-    files = _reduced_copies(scene, capture, factor)
-    if files is None:
-        paths = [capture.photo_folder / name for name in capture.names]
-        sizes = photo_sizes(paths)
-        note = _require_scaled(paths, sizes, capture.photo_sizes)
-        reduction = re.fullmatch(rf"{IMAGES}_(\d+)", capture.photo_folder.name)
-        smaller = capture.photo_sizes[0, 0] > 1.5 * sizes[0, 0]
-        already = int(reduction[1]) if reduction and smaller else 1
-        targets = reduced_sizes(_undistorted_sizes(capture, sizes), max(1.0, factor / already))
-        files = PhotoFiles(paths, sizes, targets, note)
-    largest = files.sizes[np.argmax(files.sizes.prod(axis=1))]
-    if largest.prod() > MOST_PIXELS:
-        raise InputError(
-            f"{scene}: a photo would have {largest[0]}x{largest[1]} pixels, more than {MOST_PIXELS}: use --factor "
-            f"{factor * math.ceil(math.sqrt(largest.prod() / MOST_PIXELS))}"
-        )
-    return files
+    if (copies := _reduced_copies(scene, capture, factor)) is not None:
+        return copies
+    paths = [capture.photo_folder / name for name in capture.names]
+    sizes = photo_sizes(paths)
+    note = _require_scaled(paths, sizes, capture.photo_sizes)
+    reduction = re.fullmatch(rf"{IMAGES}_(\d+)", capture.photo_folder.name)
+    smaller = capture.photo_sizes[0, 0] > 1.5 * sizes[0, 0]
+    already = int(reduction[1]) if reduction and smaller else 1
+    targets = reduced_sizes(_undistorted_sizes(capture, sizes), max(1.0, factor / already))
+    return PhotoFiles(paths, sizes, targets, note)
 
 
 def _reduced_copies(scene: Path, capture: Capture, factor: int) -> PhotoFiles | None:
-    """The copies in the folder beside the photos; None where one is missing or of another size."""
+    """The copies in the folder beside the photos; None where one is missing or of another size, or is to be
+    undistorted, which is done in full size."""
     folder = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
     paths = [folder / name for name in capture.names]
-    if factor == 1 or capture.photo_folder == scene or not all(path.is_file() for path in paths):
+    if factor == 1 or capture.photo_folder == scene or any(capture.lenses) or not all(map(Path.is_file, paths)):
         return None
     sizes = photo_sizes(paths)
     if (np.abs(sizes - capture.photo_sizes / factor) > 1.0).any():
         return None
-    return PhotoFiles(paths, sizes, _undistorted_sizes(capture, sizes))
+    return PhotoFiles(paths, sizes, sizes)
 
 
 def _undistorted_sizes(capture: Capture, sizes: np.ndarray) -> np.ndarray:

@@ -14,13 +14,7 @@ import numpy as np
 from PIL import Image
 
 from turbogs_plugin.captures.capture import Capture
-from turbogs_plugin.captures.decoding import (
-    DECODING_BYTES,
-    OPAQUE_SUFFIXES,
-    decoding_threads,
-    is_transparent,
-    opened_image,
-)
+from turbogs_plugin.captures.decoding import OPAQUE_SUFFIXES, decoding_threads, is_transparent, opened_image
 from turbogs_plugin.captures.photo_files import MASKS, find_photos
 from turbogs_plugin.captures.undistort import Lens
 from turbogs_plugin.errors import InputError
@@ -102,7 +96,7 @@ def load_masks(
                     keep &= np.asarray(image.convert("RGBA").getchannel("A")) > 0
         return None if keep.all() else ViewMask.of(_placed(keep, capture.lenses[view], target))
 
-    with decoding_threads(DECODING_BYTES * int(full_sizes.prod(axis=1).max(initial=1))) as pool:
+    with decoding_threads() as pool:
         return list(pool.map(load, range(len(photos))))
 
 
@@ -134,8 +128,7 @@ def require_mask_size(
 def _placed(keep: np.ndarray, lens: Lens | None, target: tuple[int, int]) -> np.ndarray:
     """[H, W] bool: the mask after what is done to its photo."""
     if lens is not None:
-        image = np.where(keep, np.uint8(255), np.uint8(0))[:, :, None]
-        keep = np.equal(lens.undistort(image, lens.size_of((keep.shape[1], keep.shape[0])))[:, :, 0], 255)
+        keep = np.asarray(lens.undistort(Image.fromarray(np.where(keep, np.uint8(255), np.uint8(0))))) == 255
     return _reduced(keep, target)
 
 

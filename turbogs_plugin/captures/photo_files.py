@@ -7,10 +7,11 @@ import re
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from turbogs_plugin.captures.capture import FEWEST_PHOTOS, require_printable
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, named, require_printable
 from turbogs_plugin.errors import InputError
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
@@ -18,7 +19,7 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 OTHER_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2")
 """Suffixes of photos that at least one of them does not read."""
 NAMED_SUFFIXES = (*PHOTO_SUFFIXES, ".webp", ".avif", ".jp2")
-"""Suffixes of files that may stand for a photo that is not where a capture names it."""
+"""Suffixes of files that may stand for a photo that is not where a capture names it, as Pillow reads them."""
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".insv")
 FRAMES_OF_VIDEO = "ffmpeg -i VIDEO -vf fps=2 -q:v 2 PHOTOS/%05d.jpg"
 MASKS = "masks?(_images)?"
@@ -70,11 +71,18 @@ def _files(folder: Path, depth: int) -> list[Path]:
     return files
 
 
-def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | None:
-    """The path, relative to the scene, of a file that a capture names; None where it is not there.
+def _ends(name: str) -> list[PurePosixPath]:
+    """The paths below a folder that a name may mean: itself; of a path of the machine that wrote it, absolute or with
+    '..', each of its ends, the longest first. Separators may be Windows' ones."""
+    path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
+    parts = path.parts[1:] if path.anchor else path.parts
+    elsewhere = path.anchor or ".." in parts
+    starts = range(len(parts) if elsewhere else min(1, len(parts)))
+    return [PurePosixPath(*parts[start:]) for start in starts if ".." not in parts[start:]]
 
-    Separators may be Windows' ones. Of a path of the machine that wrote it, absolute or with '..', the longest end
-    counts that is there, so the file lies in the scene.
+
+def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | None:
+    """The path, relative to the scene, of a file that a capture names (`_ends`); None where it is not there.
 
     Args:
         folder: of the scene, that names are relative to.
@@ -83,78 +91,81 @@ def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | 
         InputError: a name that cannot be printed.
     """
     require_printable(name, source)
-    path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
-    parts = path.parts[1:] if path.anchor else path.parts
-    below = not path.anchor and ".." not in parts
-    ends = [parts[first:] for first in range(1 if below else len(parts)) if parts and ".." not in parts[first:]]
-    forms = (PurePosixPath(folder, *end).as_posix() for end in ends)
+    forms = ((PurePosixPath(folder) / end).as_posix() for end in _ends(name))
     return next((form for form in forms if (scene / form).is_file()), None)
 
 
+@dataclass(frozen=True)
+class FoundPhotos:
+    """The photos of a capture that are there, in the order of their names.
+
+    Args:
+        folder: that all of them lie in: one in the scene, else the scene.
+        names: relative to the folder.
+        places: of the photos among the names that the capture has.
+        notes: lines for the user, on photos that are not where the capture says and on those that are nowhere.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    places: list[int]
+    notes: list[str]
+
+
 def find_named(
-    scene: Path,
-    names: Sequence[str],
-    source: Path,
-    folders: Sequence[str],
-    others: Collection[str] = (),
-    anywhere: bool = True,
-) -> tuple[list[str | None], list[str]]:
+    scene: Path, names: Sequence[str], source: Path, folders: Sequence[str], others: Collection[str] = ()
+) -> FoundPhotos:
     """The photos that a capture names: the one rule for every kind of capture.
 
     - A photo counts that is where its name says (`file_named`), in the first of `folders` that has it; where fewer than
       `FEWEST_PHOTOS` are, in ``images_2``, ``images_4``, ...
-    - Another name stands for a file in the folder that it says, of any suffix and in any letters. Where photos have
-      neighbours of other suffixes (masks, depths), it stands for none.
-    - Where no name is found so, names stand for files in the scene and in folders of it, `FOLDER_DEPTH` deep; for none
-      where a file may be meant by two names, or a name by two files.
+    - Another name stands for a file in the folder that it says, of any suffix, in any letters and any form of Unicode.
+    - Where no name is found so, names stand for files in the scene and in folders of it, `FOLDER_DEPTH` deep.
 
-    Of several files for a name, one of its suffix counts before others, then one whose path ends as the name does.
+    Of several files for a name, one of its suffix counts before others, then one whose path ends as the name does. A
+    name with several files left, and names with one file in common, stand for none.
 
     Args:
         folders: in the scene, that names are relative to; '' for the scene itself.
         others: names of files that are no photos.
-        anywhere: the last rule is followed.
-
-    Returns:
-        The photos' paths relative to the scene, None where there is no photo; a note or none on photos that are not
-        where their names say.
 
     Raises:
-        InputError: a name that cannot be printed, or that is there twice.
+        InputError: a name that cannot be printed, a photo that is named twice, or fewer than `FEWEST_PHOTOS` photos.
     """
-    places = (folders, *((folder,) for folder in REDUCED))
-    tries = ([_first_there(scene, name, source, place) for name in names] for place in places)
-    first = next(tries)
-    found = first if _count(first) >= FEWEST_PHOTOS else next((each for each in tries if _count(each)), first)
-    plain = [path or PureWindowsPath(name).as_posix() for path, name in zip(found, names, strict=True)]
-    if twice := [path for path, times in Counter(plain).items() if times > 1]:
+    found: list[str | None] = []
+    for places in (folders, *([folder] for folder in REDUCED)):
+        here = [
+            next(filter(None, (file_named(scene, name, source, place) for place in places)), None) for name in names
+        ]
+        found = found or here
+        if len(here) - here.count(None) >= FEWEST_PHOTOS:
+            found = here
+            break
+    written = [path or PureWindowsPath(name).as_posix() for path, name in zip(found, names, strict=True)]
+    if twice := [path for path, times in Counter(written).items() if times > 1]:
         raise InputError(f"{source} names the photo {twice[0]} twice: take one out, or rename the photos")
-    moved: dict[int, str] = {}
-    if None in found:
-        index = _index(scene, {PurePosixPath(other) for other in others})
-        if not any(len(_like(index, PureWindowsPath(path), [""])) > 1 for path in filter(None, found)):
-            missing = {place: PureWindowsPath(names[place]) for place, path in enumerate(found) if path is None}
-            moved, _ = _moved(index, missing, folders)
-            moved = {place: path for place, path in moved.items() if path not in found}  # another name's photo
-            if anywhere and not moved and not any(found):
-                moved, clear = _moved(index, missing, None)
-                moved = moved if clear else {}
-    paths = [moved.get(place, path) for place, path in enumerate(found)]
-    return paths, _moved_note(names, moved, source)
-
-
-def _first_there(scene: Path, name: str, source: Path, folders: Sequence[str]) -> str | None:
-    return next((path for folder in folders if (path := file_named(scene, name, source, folder))), None)
-
-
-def _count(found: Sequence[str | None]) -> int:
-    return sum(path is not None for path in found)
-
-
-def common_folder(scene: Path, paths: Sequence[str]) -> Path:
-    """The folder in the scene that all photos lie in, whose paths are relative to the scene; else the scene itself."""
-    first = {parts[0] if len(parts := PurePosixPath(path).parts) > 1 else "" for path in paths}
-    return scene / first.pop() if len(first) == 1 else scene
+    missing = [place for place, path in enumerate(found) if path is None]
+    index = {} if not missing else _index(scene, {*written, *(PureWindowsPath(other).as_posix() for other in others)})
+    moved = _distinct({place: _best(_beside(index, names[place], folders), names[place]) for place in missing})
+    if not moved and len(missing) == len(found):
+        moved = _distinct({place: _best(index.get(_stem(names[place]), []), names[place]) for place in missing})
+    pairs = sorted((moved.get(place) or path or "", place) for place, path in enumerate(found))
+    pairs = [(path, place) for path, place in pairs if path]
+    absent = [written[place] for place in missing if place not in moved]
+    if absent and len(pairs) < FEWEST_PHOTOS:
+        raise InputError(
+            f"{source} names {len(names)} photos, of which {len(absent)} are missing in {scene} ({named(absent)}): at "
+            f"least {FEWEST_PHOTOS} are needed; copy the photos there"
+        )
+    note = f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {named(absent, most=1)}"
+    inner = {path.split("/")[0] if "/" in path else "" for path, _ in pairs}
+    folder = scene / inner.pop() if len(inner) == 1 else scene
+    return FoundPhotos(
+        folder,
+        tuple((scene / path).relative_to(folder).as_posix() for path, _ in pairs),
+        [place for _, place in pairs],
+        [*_moved_note(names, moved, source), *([note] if absent else [])],
+    )
 
 
 def _moved_note(names: Sequence[str], moved: dict[int, str], source: Path) -> list[str]:
@@ -168,14 +179,20 @@ def _moved_note(names: Sequence[str], moved: dict[int, str], source: Path) -> li
 
 
 Index = dict[str, list[PurePosixPath]]
-"""Paths of files relative to a scene, by their stems in `_plain` letters."""
+"""Paths of files relative to a scene, by their stems (`_stem`)."""
 
 
 def _plain(text: str) -> str:
     return unicodedata.normalize("NFC", text).lower()
 
 
-def _index(scene: Path, others: Collection[PurePosixPath]) -> Index:
+def _stem(name: str) -> str:
+    """A photo's name without folders and suffix, in plain letters. What is no suffix of an image is part of it."""
+    path = PureWindowsPath(name)
+    return _plain(path.stem if path.suffix.lower() in (*NAMED_SUFFIXES, *OTHER_SUFFIXES) else path.name)
+
+
+def _index(scene: Path, others: Collection[str]) -> Index:
     """The files of a scene that may be photos, but for `others`."""
     files: Index = defaultdict(list)
     for folder, inner, inside in os.walk(scene, followlinks=True):
@@ -184,47 +201,29 @@ def _index(scene: Path, others: Collection[PurePosixPath]) -> Index:
         inner[:] = sorted(filter(str.isprintable, set(inner).difference(barred)))
         if len(place.parts) == FOLDER_DEPTH:
             inner.clear()
-        for file in map(PurePosixPath, sorted(inside)):
-            if place / file not in others and file.suffix.lower() in NAMED_SUFFIXES:
-                files[_plain(file.stem)].append(place / file)
+        for file in sorted(inside):
+            if str(place / file) not in others and PurePosixPath(file).suffix.lower() in NAMED_SUFFIXES:
+                files[_stem(file)].append(place / file)
     return files
 
 
-def _like(index: Index, name: PureWindowsPath, folders: Sequence[str] | None) -> list[PurePosixPath]:
-    """The files of a name's stem, in any letters and of any suffix.
-
-    Args:
-        folders: that names are relative to, in which alone files count; None: files of any folder count.
-    """
-    # A number after a point is part of the name, and so is what is no suffix.
-    stems = [name.name] if name.suffix[1:].isdigit() else [name.stem, name.name]
-    files = [file for stem in dict.fromkeys(stems) for file in index.get(_plain(stem), ())]
-    if folders is None:
-        return files
-    parts = name.parts[bool(name.anchor) : -1]
-    places = {PurePosixPath(folder, *parts) for folder in folders}
-    own = (file for file in files if file.parent in places or (name.anchor and _common_end(file, name) > 0))
-    return list(own)
+def _beside(index: Index, name: str, folders: Sequence[str]) -> list[PurePosixPath]:
+    """The files of a name's stem in a folder that the name says."""
+    places = {PurePosixPath(folder) / end.parent for folder in folders for end in _ends(name)}
+    return [file for file in index.get(_stem(name), ()) if file.parent in places]
 
 
-def _moved(
-    index: Index, names: dict[int, PureWindowsPath], folders: Sequence[str] | None
-) -> tuple[dict[int, str], bool]:
-    """The one file that each name stands for, and whether no name has several files, and no file several names."""
-    moved, clear = {}, True
-    for place, name in names.items():
-        files = _like(index, name, folders)
-        files = [file for file in files if _plain(file.name) == _plain(name.name)] or files
-        nearest = max((_common_end(file, name) for file in files), default=0)
-        files = [file for file in files if _common_end(file, name) == nearest]
-        clear &= len(files) < 2
-        if len(files) == 1:
-            moved[place] = str(files[0])
+def _best(files: Sequence[PurePosixPath], name: str) -> str:
+    """The one of these files that a name stands for; empty where it is not clear."""
+    path = PureWindowsPath(name)
+    files = [file for file in files if _plain(file.name) == _plain(path.name)] or list(files)
+    pairs = [list(zip(reversed(file.parts[:-1]), reversed(path.parts[:-1]), strict=False)) for file in files]
+    ends = [len(list(takewhile(lambda both: both[0] == both[1], each))) for each in pairs]
+    best = [file for file, end in zip(files, ends, strict=True) if end == max(ends)]
+    return str(best[0]) if len(best) == 1 else ""
+
+
+def _distinct(moved: dict[int, str]) -> dict[int, str]:
+    """The places whose file is no other place's."""
     times = Counter(moved.values())
-    return {place: path for place, path in moved.items() if times[path] == 1}, clear and len(times) == len(moved)
-
-
-def _common_end(file: PurePosixPath, name: PureWindowsPath) -> int:
-    """The number of equal folders at the end of both paths."""
-    pairs = zip(reversed(file.parts[:-1]), reversed(name.parts[:-1]), strict=False)
-    return len(list(takewhile(lambda both: both[0] == both[1], pairs)))
+    return {place: path for place, path in moved.items() if path and times[path] == 1}

@@ -12,45 +12,19 @@ from turbogs_plugin.scene.photos import Photos, pixel_offsets
 from turbogs_plugin.types import Cameras
 
 NUM_RANDOM_POINTS = 50_000
-CELLS, ENOUGH_CELLS = (8, 6), 0.25
-"""Columns and rows of the cells that a view's image is cut into, and the share of them that must have points."""
-PROBES = 10_000
-"""Random points that are projected into all views."""
-PROJECTED_AT_ONCE = 1 << 20
-"""Points times views: it bounds memory."""
+LOOKING = 0.9
+"""Share of the views that must have one point in their images to be taken for views of one thing."""
 LEAST_SPACING = 1e-2
 """Cameras nearer to each other than this share of their extent are taken to be in one place."""
 COLOR_VIEWS = 32
 """Photos that give random points their colours, at most."""
 
 
-def random_points(viewmats: np.ndarray) -> np.ndarray:
-    """[M, 3] float64, the same for the same cameras.
-
-    The cube's centre is the point nearest to all viewing axes, its side the median distance of the cameras from it.
-
-    Args:
-        viewmats: [V, 4, 4] float64 world to camera.
-    """
-    centers = camera_centers(viewmats)
-    axes = viewmats[:, 2, :3]
-    # A slight pull towards the cameras' mean settles the case of parallel axes.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [V, 3, 3]
-    mean = centers.mean(axis=0)
-    pull = 1e-3 * len(centers) * np.eye(3)
-    offsets = np.einsum("vij,vj->i", across, centers - mean)
-    focus = mean + np.linalg.solve(across.sum(axis=0) + pull, offsets)
-    side = float(np.median(np.linalg.norm(centers - focus, axis=1)))
-    random = np.random.default_rng(0)
-    return focus + random.uniform(-0.5, 0.5, (NUM_RANDOM_POINTS, 3)) * (side or 1.0)
-
-
 def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, str]:
     """Points for a capture without any, the same for the same cameras, and how they were drawn.
 
-    `random_points` serve, where all views see enough of them. In proportion to the views that do not, part
-    of them is drawn within these views instead: between half of the cameras' extent, or less where cameras stand
-    closer, and ten times it.
+    Where cameras look at one thing (`LOOKING`), points fill a cube about the point nearest to all viewing axes, whose
+    side is the median distance of the cameras from it. Elsewhere they are drawn within the views, by `_depth_bounds`.
 
     Args:
         viewmats: [V, 4, 4] float64 world to camera.
@@ -60,46 +34,24 @@ def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> 
     Returns:
         [`NUM_RANDOM_POINTS`, 3] float64, and words that go on from "random points".
     """
-    points = random_points(viewmats)
-    how = "about what the cameras look at"
-    lacking = shares_with_points(points[:PROBES], viewmats, Ks, sizes) < ENOUGH_CELLS
-    if not lacking.any():
-        return points, how
-    count = round(len(points) * lacking.mean())
-    bounds = np.tile(_depth_bounds(camera_centers(viewmats)), (int(lacking.sum()), 1))
-    within = points_in_views(viewmats[lacking], Ks[lacking], sizes[lacking], bounds, count)
-    if not np.isfinite(within).all():  # by poses or intrinsics that the capture's check names
-        return points, how
-    rest = len(points) - count
-    cameras = f"{len(bounds):,} of {len(lacking):,} cameras"
-    if rest == 0:
-        return within, f"before the {len(bounds):,} cameras, which do not look at one thing"
-    how = f"of which {rest:,} are {how}, {count:,} before {cameras} that do not see these"
-    return np.concatenate([points[:rest], within]), how
-
-
-def shares_with_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """[V] float64: share of the cells of a grid (`CELLS`) over each view's image that have a point in them.
-
-    Args:
-        points: [M, 3] float64.
-        viewmats, Ks, sizes: as for `starting_points`.
-    """
-    columns, rows = CELLS
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        to_cells = Ks @ viewmats[:, :3]  # [V, 3, 4], in cells in place of pixels
-        to_cells[:, :2] *= (CELLS / np.asarray(sizes, dtype=np.float64))[:, :, None]
-    homogeneous = np.column_stack([points, np.ones(len(points))]).T  # [4, M]
-    shares = []
-    for part in np.array_split(to_cells, -(-len(to_cells) * len(points) // PROJECTED_AT_ONCE)):
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            x, y, depth = np.moveaxis(part @ homogeneous, 1, 0)  # each [v, M]
-            x, y = x / depth, y / depth
-            inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < columns) & (y < rows)
-        found = np.zeros((len(part), rows, columns), dtype=bool)
-        found[inside.nonzero()[0], y[inside].astype(int), x[inside].astype(int)] = True
-        shares.append(found.mean(axis=(1, 2)))
-    return np.concatenate(shares)
+    centers = camera_centers(viewmats)
+    axes = viewmats[:, 2, :3]
+    # A slight pull towards the cameras' mean settles the case of parallel axes.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [V, 3, 3]
+    mean = centers.mean(axis=0)
+    pull = 1e-3 * len(centers) * np.eye(3)
+    offsets = np.einsum("vij,vj->i", across, centers - mean)
+    focus = mean + np.linalg.solve(across.sum(axis=0) + pull, offsets)
+    x, y, depth = np.einsum("vij,vj->iv", Ks, viewmats[:, :3, :3] @ focus + viewmats[:, :3, 3])
+    inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < sizes[:, 0] * depth) & (y < sizes[:, 1] * depth)
+    if inside.mean() < LOOKING:
+        bounds = np.tile(_depth_bounds(centers), (len(centers), 1))
+        within = points_in_views(viewmats, Ks, sizes, bounds, NUM_RANDOM_POINTS)
+        return within, "before the cameras, which do not look at one thing"
+    side = float(np.median(np.linalg.norm(centers - focus, axis=1)))
+    random = np.random.default_rng(0)
+    points = focus + random.uniform(-0.5, 0.5, (NUM_RANDOM_POINTS, 3)) * (side or 1.0)
+    return points, "about what the cameras look at"
 
 
 def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
@@ -112,8 +64,6 @@ def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
     extent = float(np.median(np.linalg.norm(centers - mean, axis=1)))
     if extent <= 1e-12 * np.abs(centers).max():  # all in one place but for rounding
         return 0.5, 10.0
-    if not np.isfinite(extent):
-        return extent, extent
     # Cameras of a rig stand in one place: the spacing is between places.
     rounded = np.round(((centers - mean) / (LEAST_SPACING * extent)).clip(-1e15, 1e15))
     places = torch.from_numpy(np.unique(rounded, axis=0))

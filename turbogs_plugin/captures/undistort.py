@@ -1,44 +1,36 @@
-"""Photos of lenses with distortion, turned into photos of a pinhole camera in the same place.
+"""Photos of lenses with distortion, turned into photos of a pinhole camera in the same place, by COLMAP.
 
-COLMAP chooses the pinhole camera: as fine as the photo on its axis, its image the largest that the photo fills. Where a
-lens model maps two directions to one pixel, COLMAP's choice shows some of the photo twice: it is shrunk about its
-middle until it does not. The map from the pinhole's image to the photo is kept on a lattice, by the lens's projection.
+COLMAP chooses the pinhole camera: as fine as the photo on its axis, its image the largest that the photo fills.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-import torch.nn.functional as F
+from PIL import Image
 
 from turbogs_plugin.errors import InputError
 
 if TYPE_CHECKING:
     import pycolmap
 
-Projection = Callable[[np.ndarray], np.ndarray]
-"""[N, 2] float64 points at depth 1 before the camera -> [N, 2] pixels of the photo (the first one's centre is at 0.5),
-NaN where there is none."""
-
+STRAIGHT_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""COLMAP's camera models that are a pinhole where all their parameters of distortion, if any, are 0."""
 WIDEST_ANGLE = math.radians(60.0)
 """Largest angle off the axis in the pinhole image: a fisheye's rim would become a smear."""
 LARGEST_GROWTH = 2.0
 """The pinhole image has at most this many times the sides of the photo (COLMAP's `max_scale`)."""
-SHARES = np.linspace(1.0, 0.1, 91)
-"""Sizes of the pinhole image that are tried, in COLMAP's choice."""
-LATTICE = 129
-"""Nodes of a map along either side. Between them it is linear: off by less than 0.05 pixels in strong distortion."""
+GRID = 129
+"""Places along either side of a pinhole image at which it is checked against the photo."""
 SMALLEST_SHARE = 0.1
 """A pinhole image that covers less of the photo's width or height is not one of a lens."""
-LATTICE_EDGE = 0.5
-"""Pixels by which a node of the map may leave the photo."""
-ROWS_AT_ONCE = 256
+EDGE = 0.5
+"""Pixels by which the border of the pinhole image may leave the photo."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,147 +38,114 @@ class Lens:
     """A camera with distortion and the pinhole camera that takes its place.
 
     Args:
-        model: name of the camera model, as COLMAP has it.
-        photo_size: (width, height) of the photos that it was calibrated on.
+        camera: as it is.
         size: (width, height) of the pinhole's images.
         K: [3, 3] float64, intrinsics of the pinhole.
-        sources: [LATTICE, LATTICE, 2] float32: where in the photo the pinhole's image comes from, at nodes that span it
-            from edge to edge; x and y are -1 .. 1 from edge to edge of the photo, so photos of any size will do.
     """
 
-    model: str
-    photo_size: tuple[int, int]
+    camera: pycolmap.Camera
     size: tuple[int, int]
     K: np.ndarray
-    sources: np.ndarray
+
+    @property
+    def model(self) -> str:
+        """Name of the camera model, as COLMAP has it."""
+        return self.camera.model.name
+
+    @property
+    def photo_size(self) -> tuple[int, int]:
+        """(width, height) of the photos that it was calibrated on."""
+        return self.camera.width, self.camera.height
 
     def size_of(self, photo_size: tuple[int, int]) -> tuple[int, int]:
-        """(width, height) of the pinhole's image for photos of another size than those that it was calibrated on."""
-        ratios = np.divide(photo_size, self.photo_size)
+        """(width, height) of the pinhole's image for photos of another size than those that it was calibrated on:
+        smaller for smaller ones, and no larger for larger ones."""
+        ratios = np.divide(photo_size, self.photo_size).clip(max=1.0)
         width, height = np.floor(np.multiply(self.size, ratios) + 0.5).astype(np.int64).tolist()
         return max(width, 1), max(height, 1)
 
-    def undistort(self, photo: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """The pinhole's image, bilinearly.
+    def undistort(self, photo: Image.Image) -> Image.Image:
+        """The pinhole's image, of `size`. Photos of another size than `photo_size` get that first."""
+        import pycolmap
 
-        Args:
-            photo: [h, w, C] uint8, of any size with the proportions of `photo_size`.
-            size: (width, height) of the result, with the proportions of the pinhole's.
-
-        Returns:
-            [height, width, C] uint8.
-        """
-        width, height = size
-        planes = torch.from_numpy(np.ascontiguousarray(photo.transpose(2, 0, 1), dtype=np.float32))[None]
-        across, down = _weights(width), _weights(height)
-        result = np.empty((height, width, photo.shape[2]), dtype=np.uint8)
-        for first in range(0, height, ROWS_AT_ONCE):  # a whole map would take more than the photo
-            rows = slice(first, first + ROWS_AT_ONCE)
-            lines = _between(self.sources, down[0][rows], down[1][rows, None, None])  # [R, LATTICE, 2]
-            grid = _between(lines.transpose(1, 0, 2), across[0], across[1][:, None, None])  # [width, R, 2]
-            sources = torch.from_numpy(np.ascontiguousarray(grid.transpose(1, 0, 2)))[None]
-            band = F.grid_sample(planes, sources, padding_mode="border", align_corners=False)[0]
-            result[rows] = band.add_(0.5).to(torch.uint8).permute(1, 2, 0).numpy()
-        return result
+        if photo.size != self.photo_size:
+            photo = photo.resize(self.photo_size, Image.Resampling.BILINEAR)
+        planes = np.asarray(photo).reshape(photo.height, photo.width, -1)
+        parts = [planes[..., :3], planes[..., 3:]] if planes.shape[2] == 4 else [planes]  # COLMAP knows no alpha
+        made = []
+        for part in parts:
+            bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(part))
+            image, _ = pycolmap.undistort_image(_options(), bitmap, self.camera)
+            made.append(image.to_array().reshape(*self.size[::-1], -1))
+        return Image.frombytes(photo.mode, self.size, np.concatenate(made, axis=2).tobytes())
 
 
-def _weights(pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """The node before each pixel's centre, int64, and how far on it lies towards the next one, float32."""
-    places = (np.arange(pixels) + 0.5) * ((LATTICE - 1) / pixels)
-    before = np.minimum(places.astype(np.int64), LATTICE - 2)
-    return before, (places - before).astype(np.float32)
-
-
-def _between(nodes: np.ndarray, before: np.ndarray, share: np.ndarray) -> np.ndarray:
-    start = nodes[before]
-    return start + share * (nodes[before + 1] - start)
-
-
-def lens_of_camera(camera: pycolmap.Camera, owner: str, project: Projection | None = None) -> Lens:
-    """The lens of a camera of any of COLMAP's models.
+def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
+    """The lens of a camera of any of COLMAP's models; None for a pinhole.
 
     Args:
         owner: names the camera in messages.
-        project: the lens's projection where COLMAP's model is only near it; None: the camera's own.
 
     Raises:
-        InputError: parameters that are not those of a lens; a panorama, which no pinhole camera can show.
+        InputError: parameters that are not those of a lens within the photo; a panorama, which no pinhole camera can
+            show.
     """
-    import pycolmap
-
-    model, photo_size = camera.model.name, (camera.width, camera.height)
+    model, extra = camera.model.name, list(camera.extra_params_idxs())
+    if model in STRAIGHT_MODELS and not camera.params[extra].any():
+        return None
     if not camera.is_perspective():
         raise InputError(
             f"{owner} is {model}, a panorama: cut it into perspective photos and reconstruct these "
             "(pycolmap's example panorama_sfm.py does both)"
         )
-    options = pycolmap.UndistortCameraOptions(
+    lens = _lens(model, (camera.width, camera.height), tuple(camera.params.tolist()))
+    if lens is None:
+        raise InputError(
+            f"{owner} is {model} with parameters that are not those of a lens, or whose image folds within the photo: "
+            "reconstruct the capture again, with the model OPENCV_FISHEYE for a wide lens"
+        )
+    return lens
+
+
+@lru_cache(maxsize=64)
+def _lens(model: str, photo_size: tuple[int, int], params: tuple[float, ...]) -> Lens | None:
+    """The lens of a camera's numbers, which the cameras of many photos share; None where they are not those of one."""
+    import pycolmap
+
+    if not np.isfinite(params).all():
+        return None
+    camera = pycolmap.Camera(model=model, width=photo_size[0], height=photo_size[1], params=params)
+    try:
+        pinhole = pycolmap.undistort_camera(_options(), camera)
+    except Exception:  # pycolmap raises whatever C++ threw
+        return None
+    return (
+        Lens(camera, (pinhole.width, pinhole.height), pinhole.calibration_matrix()) if _fits(camera, pinhole) else None
+    )
+
+
+def _options() -> pycolmap.UndistortCameraOptions:
+    import pycolmap
+
+    return pycolmap.UndistortCameraOptions(
         blank_pixels=0.0, max_scale=LARGEST_GROWTH, max_cam_point_norm=math.tan(WIDEST_ANGLE)
     )
-    trouble = InputError(
-        f"{owner} is {model} with parameters that are not those of a lens: nothing of its photos can be undistorted; "
-        "reconstruct the capture again"
-    )
-    if not np.isfinite(camera.params).all():
-        raise trouble
-    try:
-        pinhole = pycolmap.undistort_camera(options, camera)
-    except Exception as error:  # pycolmap raises whatever C++ threw
-        raise trouble from error
-
-    def own(points: np.ndarray) -> np.ndarray:
-        return camera.img_from_cam(np.concatenate([points, np.ones((len(points), 1))], axis=1))
-
-    focal = np.array([pinhole.focal_length_x, pinhole.focal_length_y])
-    center = np.array([pinhole.principal_point_x, pinhole.principal_point_y])
-    whole = np.array([pinhole.width, pinhole.height])
-    for share in SHARES:
-        size = np.floor(share * whole).astype(np.int64)
-        shifted = center - 0.5 * (whole - size)
-        if min(size) < 1:
-            break
-        if (nodes := _nodes(size / focal, -shifted / focal, project or own, photo_size)) is not None:
-            K = np.array([[focal[0], 0.0, shifted[0]], [0.0, focal[1], shifted[1]], [0.0, 0.0, 1.0]])
-            return Lens(model, photo_size, (int(size[0]), int(size[1])), K, nodes)
-    raise trouble
 
 
-def _nodes(extent: np.ndarray, corner: np.ndarray, project: Projection, sides: tuple[int, int]) -> np.ndarray | None:
-    """`Lens.sources` of a pinhole image; None where the photo does not fill it, or shows some of it mirrored.
-
-    Args:
-        extent, corner: [2] width and height of the image, and its corner at the top left, at depth 1.
-        sides: (width, height) of the photo.
-    """
-    x, y = (np.linspace(corner[axis], corner[axis] + extent[axis], LATTICE) for axis in (0, 1))
+def _fits(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> bool:
+    """True where the photo of a camera fills the pinhole image, and shows none of it mirrored."""
+    sides = (camera.width, camera.height)
+    x, y = (np.linspace(0.0, side, GRID) for side in (pinhole.width, pinhole.height))
+    K = pinhole.calibration_matrix()
+    rays = np.stack([*np.meshgrid((x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]), np.ones((GRID, GRID))], axis=-1)
     with np.errstate(all="ignore"):
-        nodes = project(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-        least, most = nodes.min(axis=0), nodes.max(axis=0)  # NaN fits nowhere
-        fits = (least >= -LATTICE_EDGE) & (most <= np.add(sides, LATTICE_EDGE))
-        fits &= most - least >= np.multiply(SMALLEST_SHARE, sides)
-        nodes = nodes.reshape(LATTICE, LATTICE, 2)
-        right, down = nodes[:-1, 1:] - nodes[:-1, :-1], nodes[1:, :-1] - nodes[:-1, :-1]
+        places = np.asarray(camera.img_from_cam(rays.reshape(-1, 3)))  # NaN where there is none
+        least, most = places.min(axis=0), places.max(axis=0)  # NaN fits nowhere
+        fits = (least >= -EDGE) & (most <= np.add(sides, EDGE)) & (most - least >= np.multiply(SMALLEST_SHARE, sides))
+        places = places.reshape(GRID, GRID, 2)
+        right, down = places[:-1, 1:] - places[:-1, :-1], places[1:, :-1] - places[:-1, :-1]
         upright = right[..., 0] * down[..., 1] > right[..., 1] * down[..., 0]
-    return (2.0 * nodes / sides - 1.0).astype(np.float32) if fits.all() and upright.all() else None
-
-
-def brown_projection(
-    focal: Sequence[float], center: Sequence[float], radial: Sequence[float], p1: float, p2: float
-) -> Projection:
-    """OpenCV's model with any number of radial coefficients, all in the numerator as Metashape and nerfstudio have it.
-
-    COLMAP's models go to the third one, or put the fourth in a denominator (FULL_OPENCV).
-    """
-
-    def project(points: np.ndarray) -> np.ndarray:
-        x, y = points.T
-        squared = x * x + y * y
-        stretch = 1.0 + reduce(lambda rest, k: (rest + k) * squared, reversed(radial), 0.0)
-        bent_x = x * stretch + 2.0 * p1 * x * y + p2 * (squared + 2.0 * x * x)
-        bent_y = y * stretch + 2.0 * p2 * x * y + p1 * (squared + 2.0 * y * y)
-        return np.stack([focal[0] * bent_x + center[0], focal[1] * bent_y + center[1]], axis=1)
-
-    return project
+    return bool(fits.all() and upright.all())
 
 
 def undistortion_note(lenses: Sequence[Lens | None]) -> str:

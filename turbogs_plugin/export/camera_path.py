@@ -95,7 +95,7 @@ def from_file(path: Path, frame: Frame, frames: int) -> Cameras:
     width, height = (number(name) for name in ("w", "h"))
     if not (width and height and 2 <= width <= LARGEST_SIDE and 2 <= height <= LARGEST_SIDE):
         raise InputError(f"{path} has no size of the film: give w and h in pixels")
-    K = pinhole(content, path, (width, height), angles="x")
+    K = pinhole(content, path, (width, height))
     if K is None or K[0, 0] <= 0:
         raise InputError(f"{path} has neither fl_x nor a camera_angle_x in 0 .. pi")
     viewmats = [

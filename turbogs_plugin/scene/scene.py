@@ -44,19 +44,6 @@ class Observations:
         return Observations(self.pixels[rows] * ratios[now], now, self.point_ids[rows])
 
 
-@dataclass(frozen=True)
-class PosedViews:
-    """The cameras of V photos, and what the photos show of the scene's points.
-
-    Args:
-        cameras: float32, in the scene's normalised frame.
-        observations: None: the capture does not say.
-    """
-
-    cameras: Cameras
-    observations: Observations | None
-
-
 @dataclass
 class PosedImages:
     """V photos with their cameras.
@@ -80,10 +67,6 @@ class PosedImages:
 
     def __len__(self) -> int:
         return len(self.names)
-
-    @property
-    def posed(self) -> PosedViews:
-        return PosedViews(self.cameras, self.observations)
 
     def to(self, device: torch.device | str) -> PosedImages:
         return replace(self.with_cameras_on(device), photos=self.photos.to(device))

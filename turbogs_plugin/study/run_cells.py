@@ -20,7 +20,8 @@ from pathlib import Path
 
 import torch
 
-from turbogs_plugin.captures.camera_refinement import load_and_find, with_cameras
+from turbogs_plugin.captures.camera_refinement import refine_cameras
+from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.device import free_device_memory, processor_cores
 from turbogs_plugin.distributed.processes import end_with_parent
@@ -152,9 +153,8 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
 def _loaded(path: str, factor: int, test_every: int, refined: bool) -> tuple[Scene, str, float]:
     """Capture, its digest, and the seconds in which it was loaded. It stays for the next cells."""
     started = time.perf_counter()
-    scene, cameras = load_and_find(Path(path), factor, test_every)
-    own = with_cameras(scene, cameras, refined)
-    return own, capture_digest(scene), time.perf_counter() - started
+    scene = load_scene(path, factor, test_every)
+    return refine_cameras(scene, refined), capture_digest(scene), time.perf_counter() - started
 
 
 def _require_same_settings(study: Study, configs: dict[CellKey, Config]) -> None:

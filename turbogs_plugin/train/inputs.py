@@ -9,7 +9,8 @@ from pathlib import Path
 
 import torch
 
-from turbogs_plugin.captures.camera_refinement import load_and_find, with_cameras
+from turbogs_plugin.captures.camera_refinement import find_cameras, with_cameras
+from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.ranks import ONE, Ranks
@@ -56,11 +57,11 @@ def open_scene(config: Config, folder: RunFolder | None = None, ranks: Ranks = O
             f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
             f"in {folder.config}"
         )
-    progress = show_loading if ranks.first else None
-    scene, cameras = load_and_find(settings.path, settings.factor, settings.test_every, progress, find=ranks.first)
+    scene = load_scene(settings.path, settings.factor, settings.test_every, show_loading if ranks.first else None)
     if folder is None and not settings.force:
         require_agreement(scene)
-    return with_cameras(scene, ranks.agree(cameras), config.train.refine_cameras)
+    cameras = find_cameras(scene, config.train.refine_cameras) if ranks.first else None
+    return with_cameras(scene, ranks.agree(cameras))
 
 
 def open_started(

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.captures.fingerprint import frame_of_state
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
@@ -26,6 +25,7 @@ from turbogs_plugin.model.gsplat_world import out_of_gsplat_world
 from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.model.torch_file import read_plain
 from turbogs_plugin.scene import Frame, PosedImages, Scene
+from turbogs_plugin.scene.fingerprint import frame_of_state
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.train.look import Background, Look

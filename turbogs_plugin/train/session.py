@@ -11,11 +11,11 @@ from typing import Any
 
 import torch
 
-from turbogs_plugin.captures.fingerprint import capture_difference, capture_state
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import Plan
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.checkpoint import latest_checkpoint, require_like, save_checkpoint
 from turbogs_plugin.train.clock import WallClock, WallRecord
