@@ -227,7 +227,7 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
     whole = save_splats(folder / "whole.pt", model).read_bytes()
     return {
         "absent": (folder / "absent.ply", "no such model"),
-        "another kind": (written("model.obj", b"x"), "a .ply, .splat, .spz or gsplat's .pt"),
+        "another kind": (written("model.obj", b"x"), "a .ply, .spz or gsplat's .pt"),
         "empty folder": (empty, "without a checkpoint of a run"),
         "no archive": (written("text.pt", b"text"), "not a whole file of torch.save"),
         "cut": (written("cut.pt", whole[:-300]), "cannot be used"),
@@ -237,9 +237,7 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
         "no rows": (save_splats(folder / "none.pt", model.map(lambda value: value[:0])), "holds no Gaussians: export"),
         "not a ply": (written("text.ply", b"text"), "not a .ply file"),
-        "not a splat": (written("text.splat", b"text"), "rows of 32; export it again, or name another file"),
         "not a spz": (written("text.spz", b"text"), "cannot read"),
-        "not compressed": (written("a.ply", b"ply\nelement chunk 1\nend_header\n"), "not a compressed .ply"),
     }
 
 

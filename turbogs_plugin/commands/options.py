@@ -41,7 +41,7 @@ class RunOptions:
             host if need be, then the number of Gaussians is limited.
         time_budget: time of training to end after: 20s, 2m (budget.time). The schedule is fitted to it.
         init: start of the model (train.init): points of the capture, random points, or a model trained anywhere: a
-            .ply, .splat, .spz, gsplat's .pt, a checkpoint, or a run's folder.
+            .ply, .spz, gsplat's .pt, a checkpoint, or a run's folder.
     """
 
     config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None
@@ -83,8 +83,7 @@ class GivenOptions:
     """Options of eval, render, export and view for a model in the place of a run.
 
     Args:
-        scene: the capture of a model from a file: a 3DGS .ply, .splat, .spz, gsplat's .pt, or a checkpoint. Not with
-            a run.
+        scene: the capture of a model from a file: a 3DGS .ply, .spz, gsplat's .pt, or a checkpoint. Not with a run.
         factor: scale its photos down by this.
     """
 

@@ -33,7 +33,7 @@ from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
 
 REMEDY = "; save the model again, or as a .ply"
-KINDS = "a .ply, .splat, .spz or gsplat's .pt of a 3DGS model, a checkpoint of TurboGS, or a run's folder"
+KINDS = "a .ply, .spz or gsplat's .pt of a 3DGS model, a checkpoint of TurboGS, or a run's folder"
 
 
 @dataclass
