@@ -7,7 +7,7 @@ from helpers.framework_runs import tiny_config
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
-from turbogs_plugin.train import run
+from turbogs_plugin.train import inputs, run
 
 
 @pytest.fixture(autouse=True)
@@ -17,20 +17,12 @@ def unread(monkeypatch) -> None:
     def opened(*_, **__):
         raise AssertionError("photos are read")
 
-    monkeypatch.setattr(run, "open_scene", opened)
+    monkeypatch.setattr(inputs, "load_and_find", opened)
 
 
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("budget.max_memory=2GiB", "--max-memory limits the memory of a GPU, and this run would be on a CPU: leave"),
-        ("train.init=absent.ply", "no such model 'absent.ply'"),
-    ],
-)
-@pytest.mark.parametrize("begin", [run.plan_run, run.train])
-def test_what_needs_no_photo(capture, tmp_path, begin, override, words):
-    with pytest.raises(InputError, match=words):
-        begin(tiny_config(capture, override), *([tmp_path / "run"] if begin is run.train else []))
+def test_a_model_that_is_not_there_is_missed_before_a_photo_is_read(capture, tmp_path):
+    with pytest.raises(InputError, match=r"no such model 'absent\.ply'"):
+        run.train(tiny_config(capture, "train.init=absent.ply"), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 

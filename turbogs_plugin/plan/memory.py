@@ -111,12 +111,6 @@ class MemoryDemand:
         return count
 
 
-def require_gpu_memory(device: torch.device) -> None:
-    """Raise `InputError` where the memory of a device that is no GPU is to be limited."""
-    if device.type != "cuda":
-        raise InputError("--max-memory limits the memory of a GPU, and this run would be on a CPU: leave it out")
-
-
 def hold_to_limit(config: Config, device: torch.device) -> None:
     """Hold torch to the configuration's limit of device memory, if it has one, for the rest of the process.
 
@@ -125,7 +119,8 @@ def hold_to_limit(config: Config, device: torch.device) -> None:
     """
     limit = config.budget.memory_bytes()
     if limit is not None:
-        require_gpu_memory(device)
+        if device.type != "cuda":
+            raise InputError("--max-memory limits the memory of a GPU, and this run would be on a CPU: leave it out")
         total = torch.cuda.get_device_properties(device).total_memory
         torch.cuda.set_per_process_memory_fraction(min(1.0, limit / total))
 

@@ -11,8 +11,7 @@ from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.inputs import resolve_device
 from turbogs_plugin.train.look import Look, interpolated_exposures
-from turbogs_plugin.train.metrics import evaluate
-from turbogs_plugin.train.perceptual import load_flip, load_lpips
+from turbogs_plugin.train.metrics import evaluate, load_lpips
 from turbogs_plugin.train.saved_model import SavedModel, load_with_capture
 
 
@@ -28,10 +27,8 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
     views, look = views_of(model, scene, "test")
     views = place_views(views, model.gaussians.device, model.config.train.photos_place)
     lpips, reason = load_lpips(model.gaussians.device)
-    flip, no_flip = load_flip()
-    metrics = evaluate(model.gaussians, views, look, lpips, flip, aligned=True, refined=True)
+    metrics = evaluate(model.gaussians, views, look, lpips, refined=True)
     note = f"\nLPIPS was not computed: {reason}" if reason else ""
-    note += f"\nFLIP was not computed: {no_flip}" if no_flip else ""
     which = f"iteration {model.iteration}" if given is None else str(path)
     speed = f"{len(model.gaussians)} Gaussians, {metrics.fps:.1f} views a second"
     return f"{views_table(metrics, with_means=True)}\n\n{which}, {speed}{note}"

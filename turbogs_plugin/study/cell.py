@@ -18,8 +18,7 @@ from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.study.results import CellResult, changes, curve_and_final, flat_settings, measured
 from turbogs_plugin.train.clock import WallClock
 from turbogs_plugin.train.loop import TrainingLoop
-from turbogs_plugin.train.metrics import Evaluations, evaluate
-from turbogs_plugin.train.perceptual import load_flip, load_lpips
+from turbogs_plugin.train.metrics import Evaluations, evaluate, load_lpips
 from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.train.trainer import Trainer
 
@@ -62,7 +61,6 @@ def train_cell(
         TrainingStopped: the model is lost.
     """
     lpips, lpips_reason = load_lpips(device)
-    flip, _ = load_flip()
     clock = WallClock()
     planned = make_plan(config, scene, device).apply(config)
     test = place_views(scene.test, device, planned.train.photos_place)
@@ -83,9 +81,8 @@ def train_cell(
     final["cell_seconds"] = loading + clock.parts["cell"]
     if device.type == "cuda":  # a CPU's peak is the process's, of the largest cell so far
         final["peak_mib"] = evaluations.history[-1].memory_bytes / 2**20
-    if lpips is not None or flip is not None:  # off the clock
-        mean = evaluate(trainer.gaussians, test, trainer.look(test.names), lpips=lpips, flip=flip).mean
-        final["lpips"], final["flip"] = mean.lpips, mean.flip
+    if lpips is not None:  # off the clock
+        final["lpips"] = evaluate(trainer.gaussians, test, trainer.look(test.names), lpips).mean.lpips
     settings = flat_settings(config.to_mapping())
     return CellResult(
         scene=scene.name,

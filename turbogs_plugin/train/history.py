@@ -22,8 +22,6 @@ class FurtherErrors:
     Args:
         own_psnr, own_ssim, own_l1: of the model's own colours, in runs that learn exposures; the plain ones there are
             of test views with the exposures of their neighbours (`interpolated_exposures`).
-        aligned_psnr, aligned_ssim, aligned_l1: of the model's own colours after a colour alignment (`align_colors`), in
-            runs that learn exposures.
         refined_psnr, refined_ssim, refined_l1: by refined cameras of the test photos (`PosedImages.refined`), at the
             end of runs whose capture says which photos show a point.
     """
@@ -31,9 +29,6 @@ class FurtherErrors:
     own_psnr: float = math.nan
     own_ssim: float = math.nan
     own_l1: float = math.nan
-    aligned_psnr: float = math.nan
-    aligned_ssim: float = math.nan
-    aligned_l1: float = math.nan
     refined_psnr: float = math.nan
     refined_ssim: float = math.nan
     refined_l1: float = math.nan

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -23,11 +22,11 @@ PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
 """Parts of the wall time in which photos are decoded, and the device is then waited for."""
 
 
-def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs doctor'") -> torch.device:
+def resolve_device(name: str) -> torch.device:
     """The device of ``auto``, ``cpu`` or ``cuda``. Raises `InputError` if CUDA is asked for and absent."""
     if name == "cuda" and not torch.cuda.is_available():
         build = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
-        raise InputError(f"CUDA was asked for and is absent ({build}): {remedy}")
+        raise InputError(f"CUDA was asked for and is absent ({build}): use --device cpu, or see 'turbogs doctor'")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
@@ -61,17 +60,12 @@ def open_scene(config: Config, folder: RunFolder | None = None, ranks: Ranks = O
 
 
 def open_started(
-    config: Config,
-    resolve: Callable[[], torch.device],
-    clock: WallClock,
-    folder: RunFolder | None = None,
-    ranks: Ranks = ONE,
+    config: Config, clock: WallClock, folder: RunFolder | None = None, ranks: Ranks = ONE
 ) -> tuple[Scene, torch.device]:
     """The capture, and the device with its kernels loaded: a thread starts it, in a second or more, while photos are
     decoded.
 
     Args:
-        resolve: says which device; what it raises is raised here.
         clock: of the wall, on which `PHOTOS` and `DEVICE` are marked.
         folder, ranks: as for `open_scene`. Where one process ends before, the others wait until their launcher ends
             them.
@@ -81,7 +75,7 @@ def open_started(
     """
 
     def start() -> torch.device:
-        device = resolve()
+        device = resolve_device(config.train.device)
         ranks.meet(device)
         synchronize(device)  # makes CUDA's context, and takes no memory through torch
         if device.type == "cuda":

@@ -62,7 +62,6 @@ class RunSession(Listener):
         resumed: whether the trainer's state was loaded.
         signal: the signal that stopped the training; None at the end of the run.
         clock: of the wall, in this process.
-        earlier_wall: seconds on the wall of the processes before; None where one did not record them.
         wall: what is recorded of it when the model is written.
     """
 
@@ -71,7 +70,6 @@ class RunSession(Listener):
     ) -> None:
         self.folder, self.plan, self.scene, self.loop = folder, plan, scene, loop
         self.clock, self.wall = clock or WallClock(), WallRecord(0.0)
-        self.earlier_wall: float | None = 0.0
         self.trainer = loop.trainer
         self.test = place_views(scene.test, self.trainer.device, self.trainer.config.train.photos_place)
         self.evaluations = Evaluations(self.test)
@@ -83,9 +81,6 @@ class RunSession(Listener):
     def run(self, report: Report | None, watch: Watch = ()) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint. The model is written before it."""
         loop, trainer, ranks = self.loop, self.trainer, self.loop.ranks
-        finished_before = loop.finished
-        if ranks.first:
-            self.folder.wall.unlink(missing_ok=True)  # so that a killed process leaves none: it is not counted as 0
         self.clock.mark("initial model")
         try:
             with interruptible(self._stop), ExitStack() as shown:
@@ -99,15 +94,14 @@ class RunSession(Listener):
                     trainer.require_finite()
                     save_ply(trainer.gaussians, self.folder.model, self.scene.frame)
                     self.clock.mark("model")
-                seconds = 0.0 if finished_before else self.clock.seconds
+                seconds = None if self.resumed else self.clock.seconds
                 if trainer.iteration != self._saved_at:
                     trainer.complete()
                     self._save()
             self.signal = None if loop.finished else ranks.stop_signal or self.signal
             if not ranks.first:
                 return self
-            wall = None if self.earlier_wall is None else self.earlier_wall + seconds
-            self.wall = WallRecord(loop.clock.seconds, wall, self.clock.parts)
+            self.wall = WallRecord(loop.clock.seconds, seconds, self.clock.parts)
             if loop.finished and report is not None:
                 report(self)
             self.wall.write(self.folder.wall)
@@ -133,7 +127,7 @@ class RunSession(Listener):
     def begun(self, loop: TrainingLoop) -> None:
         self.clock.mark("initial maps")
 
-    def evaluating(self, loop: TrainingLoop) -> None:
+    def evaluation_due(self, loop: TrainingLoop) -> None:
         self.clock.mark("training")
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
