@@ -123,7 +123,7 @@ def test_a_run_on_two_gpus_keeps_its_replicas_equal(tmp_path: Path, place):
     capture = write_demo_capture(tmp_path / "capture", views=12, width=160, height=120)
     out = tmp_path / "run"
     settings = ["train.iterations=300", "train.refine_until=200", "train.checkpoint_every=100"]
-    settings += [f"train.maps_place={place}", f"train.photos_place={place}", "density.refine_every=20"]
+    settings += [f"train.pixels_place={place}", "density.refine_every=20"]
     code = start(2, ["train", str(capture), "--out", str(out), "--no-report", "--device", "cuda", *settings], "cuda")
     assert code == 0
     lines = [json.loads(line) for line in (out / "history.jsonl").read_text().splitlines()]

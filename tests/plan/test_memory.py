@@ -74,12 +74,9 @@ def demand(*overrides: str) -> MemoryDemand:
 
 
 def test_memory_is_what_is_kept_and_what_is_done_with_it():
-    resident, maps, both = (
-        demand(*(f"train.{name}_place=host" for name in names)) for names in ([], ["maps"], ["maps", "photos"])
-    )
-    assert resident.per_gaussian == both.per_gaussian == 2 * (59 * 4 * 3 + 4 + 32) + 230 * 10
-    assert resident.fixed - maps.fixed == 4 * (200 - 20) * 8_294_400
-    assert maps.fixed - both.fixed == 3 * (225 - 22) * 8_294_400
+    resident, windows = (demand(f"train.pixels_place={place}") for place in ("device", "host"))
+    assert resident.per_gaussian == windows.per_gaussian == 2 * (59 * 4 * 3 + 4 + 32) + 230 * 10
+    assert resident.fixed - windows.fixed == (4 * (200 - 20) + 3 * (225 - 22)) * 8_294_400
     assert demand("train.sh_degree=0").per_gaussian == resident.per_gaussian - 2 * 45 * 12
 
 
@@ -97,7 +94,7 @@ def test_no_measured_peak_is_above_the_prediction():
 
 @pytest.mark.parametrize("limit", [2**33, 2**34])
 def test_as_many_gaussians_as_fit(limit):
-    memory = demand("train.maps_place=host", "train.photos_place=host")
+    memory = demand("train.pixels_place=host")
     count = memory.gaussians(limit)
     assert memory.fixed + count * memory.per_gaussian <= limit < memory.fixed + (count + 1) * memory.per_gaussian
 

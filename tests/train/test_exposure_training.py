@@ -71,7 +71,7 @@ def test_the_first_iteration_is_that_without_exposures(scene):
 @pytest.mark.parametrize("loss", ["charbonnier_ncc", "sparse_ssim"])
 def test_a_run_goes_on_bit_for_bit_and_from_host_memory(scene, loss):
     overrides = ("train.exposure=true", f"loss.type={loss}", "schedule.max_views=2")
-    hosted = (*overrides, "train.maps_place=host", "train.photos_place=host")
+    hosted = (*overrides, "train.pixels_place=host")
     whole, first, second = trainer_of(scene, *overrides), trainer_of(scene, *hosted), trainer_of(scene, *overrides)
     for _ in range(6):
         whole.step()

@@ -91,7 +91,7 @@ class ForeignLoss:
         ("pixel_sampler.unit=tile", "loss.type=sparse_ssim"),
         ("pixel_sampler.type=random",),
         ("pixel_sampler.type=dense", "train.backdrop=true"),
-        ("train.maps_place=host", "train.photos_place=host"),
+        ("train.pixels_place=host",),
         ("pixel_sampler.importance=0.5", "loss.type=charbonnier"),
         "foreign",
     ],

@@ -158,7 +158,7 @@ def test_a_capture_that_does_not_fit_is_refused(capture, tmp_path, monkeypatch, 
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(*place, full)
-    with pytest.raises(InputError, match=r"does not fit into the device's memory: use train\.photos_place=host"):
+    with pytest.raises(InputError, match=r"does not fit into the device's memory: use train\.pixels_place=host"):
         run.train(tiny_config(capture), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

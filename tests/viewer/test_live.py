@@ -68,7 +68,7 @@ def watched(new_training, scene, monkeypatch):
 @pytest.mark.parametrize("place", ["device", "host"])
 def test_a_watched_training_ends_as_an_unwatched_one(new_training, watched, monkeypatch, place):
     monkeypatch.setitem(frames.SHORTEST_INTERVALS, True, 0.0)
-    overrides = (f"train.maps_place={place}", f"train.photos_place={place}")
+    overrides = (f"train.pixels_place={place}",)
     alone = new_training(*overrides)
     alone.run()
     page, _, loop = watched(*overrides)

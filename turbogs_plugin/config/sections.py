@@ -30,8 +30,7 @@ AUTO_SETTINGS: dict[str, Any] = {
     "train.dropout": 0.0,
     "train.batch_for": 1,
     "train.iterations": None,
-    "train.maps_place": "device",
-    "train.photos_place": "device",
+    "train.pixels_place": "device",
 }
 """Setting that may be ``auto`` -> its value if no plan is made; None: `WRITTEN_FOR`. What a plan makes of ``auto`` is
 decided in `turbogs_plugin.plan.decisions`. `train.device` is not among them, as a plan is made for a given device."""
@@ -41,9 +40,6 @@ STRIPS = 8
 
 WRITTEN_FOR = 5000
 """Iterations for which the settings that count iterations are written where `train.iterations` is ``auto``."""
-
-Place = Literal["auto", "device", "host"]
-"""Where large tensors are: on the device, or in pinned memory of the host, from where a window of them travels."""
 
 
 @dataclass
@@ -82,8 +78,8 @@ class TrainConfig:
             sampling.
         seed: seed of all random numbers.
         device: ``cpu``, ``cuda``, or ``auto``: CUDA where there is a GPU.
-        maps_place: where error and age maps are (`Place`). Changes no result.
-        photos_place: where photos are (`Place`). Changes no result.
+        pixels_place: where photos, error and age maps are: on the device, or in pinned memory of the host, from where a
+            window of them travels. Changes no result.
         init: what training starts from: ``points`` of the capture; ``random`` points, in a cube about what the cameras
             look at; or a model's file, a .ply, gsplat's .pt, a checkpoint or a run's folder. A model is taken as it is:
             all its bands are in use from the start, and `initial_opacity` and `initial_size` change nothing.
@@ -124,8 +120,7 @@ class TrainConfig:
     refine_until: int = 3500
     seed: int = 0
     device: str = "auto"
-    maps_place: Place = "auto"
-    photos_place: Place = "auto"
+    pixels_place: Literal["auto", "device", "host"] = "auto"
     init: str = "points"
     init_world: Literal["capture", "gsplat"] = "capture"
     refine_cameras: bool = False

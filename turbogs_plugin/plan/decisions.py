@@ -167,35 +167,20 @@ def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
     return math.ceil(given / 100) * 100, reason
 
 
-def wanted_maps_place(facts: SceneFacts, config: Config) -> Verdict:
-    """Maps on the device, unless they do not fit even without the photos.
-
-    Photos are the first to go: of a pixel, 3 bytes travel in, of the maps 4 in and 4 out.
-    """
+def wanted_pixels_place(facts: SceneFacts, config: Config) -> Verdict:
+    """Photos and maps on the device where they fit into a share of its memory; of a pixel, 3 bytes of photos and 4 of
+    maps travel to the device each iteration otherwise, and 4 back."""
     room = HOST_SHARE * facts.host_free_bytes
-    in_file = f"> {HOST_SHARE:.0%} of {mebibytes(facts.host_free_bytes)} free on the host: in a file"
-    if facts.device == "cpu" and facts.map_bytes > room:
-        return "host", f"{mebibytes(facts.map_bytes)} {in_file}"
-    photos = facts.photo_bytes if config.train.photos_place == "device" else 0
-    place, reason = _place(facts, facts.map_bytes, photos, "photos")
-    return place, f"{reason}, {in_file}" if place == "host" and facts.map_bytes > room else reason
-
-
-def wanted_photos_place(facts: SceneFacts, config: Config) -> Verdict:
-    """Photos on the device, where they fit beside the maps that are there."""
-    maps = facts.map_bytes if decide("train.maps_place", facts, config).value == "device" else 0
-    return _place(facts, facts.photo_bytes, maps, "maps")
-
-
-def _place(facts: SceneFacts, size: int, others: int, name_of_others: str) -> Verdict:
+    in_file = f"{HOST_SHARE:.0%} of {mebibytes(facts.host_free_bytes)} free on the host: maps in a file"
     if facts.device == "cpu":
+        if facts.map_bytes > room:
+            return "host", f"{mebibytes(facts.map_bytes)} > {in_file}"
         return "device", "the device is the CPU, whose memory is the host's"
     limit = facts.device_free_bytes if facts.memory_limit is None else min(facts.device_free_bytes, facts.memory_limit)
-    fits = size + others <= DEVICE_SHARE * limit
-    beside = f" beside {mebibytes(others)} of {name_of_others}" if others else ""
-    which = "free" if limit == facts.device_free_bytes else "allowed"
-    reason = f"{mebibytes(size)}{beside} {'<=' if fits else '>'} {DEVICE_SHARE:.0%} of {mebibytes(limit)} {which}"
-    return "device" if fits else "host", reason
+    size = facts.photo_bytes + facts.map_bytes
+    fits, which = size <= DEVICE_SHARE * limit, "free" if limit == facts.device_free_bytes else "allowed"
+    reason = f"{mebibytes(size)} {'<=' if fits else '>'} {DEVICE_SHARE:.0%} of {mebibytes(limit)} {which}"
+    return "device" if fits else "host", f"{reason}, > {in_file}" if not fits and facts.map_bytes > room else reason
 
 
 def mebibytes(size: int) -> str:
@@ -214,7 +199,6 @@ RULES: dict[str, Callable[[SceneFacts, Config], Verdict]] = {
     "train.dropout": wanted_dropout,
     "train.batch_for": wanted_batch_for,
     "train.iterations": wanted_iterations,
-    "train.maps_place": wanted_maps_place,
-    "train.photos_place": wanted_photos_place,
+    "train.pixels_place": wanted_pixels_place,
 }
 """Setting that may be ``auto`` (`AUTO_SETTINGS`) -> its rule."""

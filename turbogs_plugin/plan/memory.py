@@ -85,8 +85,9 @@ class MemoryDemand:
         num_views = len(train)
         views = most_views(config, num_views)
         window = SETS * views * largest
-        photos = window + SETS * largest if config.train.photos_place == "host" else pixels + test_pixels
-        maps = window if config.train.maps_place == "host" else pixels
+        photos, maps = pixels + test_pixels, pixels
+        if config.train.pixels_place == "host":
+            photos, maps = window + SETS * largest, window
         samples = math.ceil(most_images(config, num_views) * largest)
         numbers = 14 + 3 * ((config.train.sh_degree + 1) ** 2 - 1)
         return cls(

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 
 from turbogs_plugin.config.configuration import Config, resolve
 from turbogs_plugin.config.scaling import with_batch_for, with_iterations
 from turbogs_plugin.config.sections import AUTO
-from turbogs_plugin.config.typed import build_dataclass
 from turbogs_plugin.plan.decisions import RULES, Decision, decide
 from turbogs_plugin.plan.facts import SceneFacts, gather_facts
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.yaml_json import parse_json
 
 
 @dataclass(frozen=True)
@@ -38,7 +35,7 @@ class Plan:
         return resolve(mapping)
 
     def text(self) -> str:
-        """For a terminal: a line a decision."""
+        """For a terminal, and ``plan.txt`` of a run: a line a decision."""
         name = max(len(decision.setting) for decision in self.decisions)
         value = max(len(decision.text) for decision in self.decisions)
         lines = [
@@ -46,15 +43,6 @@ class Plan:
             for decision in self.decisions
         ]
         return "\n".join([f"plan for {self.facts.train_views} training views", *lines])
-
-    def to_json(self) -> str:
-        """Read back by `from_json`."""
-        return json.dumps(asdict(self), indent=1) + "\n"
-
-    @classmethod
-    def from_json(cls, text: str) -> Plan:
-        """Raises `InputError` where the text is not a plan's."""
-        return build_dataclass(cls, parse_json(text, "the plan"), "plan")
 
 
 def make_plan(config: Config, scene: Scene, device: torch.device, processes: int = 1) -> Plan:

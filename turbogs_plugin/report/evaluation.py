@@ -25,7 +25,7 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
     """
     model, scene = open_saved(path, device_name, given)
     views, look = views_of(model, scene, "test")
-    views = place_views(views, model.gaussians.device, model.config.train.photos_place)
+    views = place_views(views, model.gaussians.device, model.config.train.pixels_place)
     lpips, reason = load_lpips(model.gaussians.device)
     metrics = evaluate(model.gaussians, views, look, lpips, refined=True)
     note = f"\nLPIPS was not computed: {reason}" if reason else ""

@@ -7,8 +7,7 @@ import shlex
 from pathlib import Path
 
 from turbogs_plugin.config.sections import STRIPS
-from turbogs_plugin.files import write_text_atomically
-from turbogs_plugin.plan import Plan
+from turbogs_plugin.files import read_text, write_text_atomically
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip
 from turbogs_plugin.report.provenance import hardware, software
 from turbogs_plugin.report.tables import ERRORS, error_columns, errors, history_rows, table, views_table
@@ -61,7 +60,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
         lpips_reason: why LPIPS was not computed; empty where it was.
         shown: test views with a picture.
     """
-    last = run.history[-1]
+    last, plan = run.history[-1], read_text(run.folder.plan) or "The run's folder holds no plan."
     config = run.trainer.config
     columns = error_columns(metrics)
     masked = run.test.masks is not None
@@ -127,7 +126,9 @@ From left to right: photo, render, error (mean absolute difference over RGB: bla
 
 ## Plan
 
-{_plan(run.plan)}
+```text
+{plan.rstrip()}
+```
 
 ## Numerical events
 
@@ -146,10 +147,3 @@ finite: {last.skipped_updates}.
 {config.to_yaml().rstrip()}
 ```
 """
-
-
-def _plan(plan: Plan | None) -> str:
-    if plan is None:
-        return "The run's folder holds no plan."
-    rows = ((decision.setting, decision.text, decision.made, decision.reason) for decision in plan.decisions)
-    return table(("setting", "value", "made", "reason"), rows)

@@ -63,7 +63,7 @@ def train_cell(
     lpips, lpips_reason = load_lpips(device)
     clock = WallClock()
     planned = make_plan(config, scene, device).apply(config)
-    test = place_views(scene.test, device, planned.train.photos_place)
+    test = place_views(scene.test, device, planned.train.pixels_place)
     clock.mark("cell")
     if not warm:
         warm_up(planned, scene, test, device)

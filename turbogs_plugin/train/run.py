@@ -136,17 +136,17 @@ def train(
     scene, device = open_started(config, clock, ranks=ranks)
     plan = make_plan(config, scene, device, ranks.count)
     clock.mark("plan")
-    remedy = "use train.photos_place=host and train.maps_place=host, --max-gaussians or a larger --factor"
+    remedy = "use train.pixels_place=host, --max-gaussians or a larger --factor"
     with _fitting(scene, remedy):
         loop = new_loop(_independent(plan.apply(config), device), scene, device, ranks)
-        session = RunSession(folder, plan, scene, loop, clock)
+        session = RunSession(folder, scene, loop, clock)
     if ranks.first:
         resolved = loop.trainer.config
         print("\n".join([*scene.notes, plan.text()]), file=sys.stderr)
         if resolved.budget.time:
             print(f"{resolved.budget.time} of training: about {resolved.train.iterations} iterations", file=sys.stderr)
         folder.path.mkdir(parents=True, exist_ok=True)
-        write_text_atomically(folder.plan, plan.to_json())
+        write_text_atomically(folder.plan, plan.text() + "\n")
         write_text_atomically(folder.asked, config.to_yaml())
         write_text_atomically(folder.config, resolved.to_yaml())
     return session.run(report, watch)
@@ -170,7 +170,7 @@ def resume(
     clock = clock or WallClock()
     clock.mark(IMPORTS)
     folder = RunFolder(path)
-    config, plan = folder.read_config(), folder.read_plan()
+    config = folder.read_config()
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None and folder.model.is_file():
         raise InputError(f"'{path}' is finished and has no checkpoint to go on from: use its {folder.model.name}")
@@ -182,7 +182,7 @@ def resume(
         resuming = state is not None
         trainer = Trainer(config, scene, device, resuming, ranks.engine(device))
         loop = TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), ranks=ranks)
-        session = RunSession(folder, plan, scene, loop, clock)
+        session = RunSession(folder, scene, loop, clock)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))
     if ranks.first:

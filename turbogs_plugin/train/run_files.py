@@ -7,8 +7,7 @@ from pathlib import Path
 
 from turbogs_plugin.config.configuration import Config, resolve_complete
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import read_text, require_writable
-from turbogs_plugin.plan import Plan
+from turbogs_plugin.files import require_writable
 from turbogs_plugin.yaml_json import read_yaml
 
 
@@ -26,7 +25,7 @@ class RunFolder:
         self.path = path
         self.asked = path / "asked.yaml"
         self.config = path / "config.yaml"
-        self.plan = path / "plan.json"
+        self.plan = path / "plan.txt"
         self.history = path / "history.jsonl"
         self.wall = path / "wall.json"
         self.checkpoints = path / "checkpoints"
@@ -70,11 +69,3 @@ class RunFolder:
         if not self.asked.is_file():
             raise InputError(f"'{self.path}' has no {self.asked.name}, which says what was asked for: train anew")
         return resolve_complete(read_yaml(self.asked), str(self.asked))
-
-    def read_plan(self) -> Plan | None:
-        """The plan made when the run began, or None. Raises `InputError` if it cannot be read."""
-        text = read_text(self.plan)
-        try:
-            return None if text is None else Plan.from_json(text)
-        except InputError as error:
-            raise InputError(f"cannot read the plan '{self.plan}': {error}") from None

@@ -14,7 +14,6 @@ import torch
 from turbogs_plugin.captures.fingerprint import capture_difference, capture_state
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.ply import save_ply
-from turbogs_plugin.plan import Plan
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.checkpoint import latest_checkpoint, require_like, save_checkpoint
@@ -56,7 +55,6 @@ class RunSession(Listener):
     """The part of a run in one process: trains, and writes the results into the run's folder.
 
     Attributes:
-        plan: the plan of the run; None if its folder holds none.
         test: the test views, on the trainer's device.
         history: every evaluation of the run.
         resumed: whether the trainer's state was loaded.
@@ -65,13 +63,11 @@ class RunSession(Listener):
         wall: what is recorded of it when the model is written.
     """
 
-    def __init__(
-        self, folder: RunFolder, plan: Plan | None, scene: Scene, loop: TrainingLoop, clock: WallClock | None = None
-    ) -> None:
-        self.folder, self.plan, self.scene, self.loop = folder, plan, scene, loop
+    def __init__(self, folder: RunFolder, scene: Scene, loop: TrainingLoop, clock: WallClock | None = None) -> None:
+        self.folder, self.scene, self.loop = folder, scene, loop
         self.clock, self.wall = clock or WallClock(), WallRecord(0.0)
         self.trainer = loop.trainer
-        self.test = place_views(scene.test, self.trainer.device, self.trainer.config.train.photos_place)
+        self.test = place_views(scene.test, self.trainer.device, self.trainer.config.train.pixels_place)
         self.evaluations = Evaluations(self.test)
         self.history = self.evaluations.history
         self.resumed = False

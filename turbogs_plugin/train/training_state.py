@@ -49,8 +49,8 @@ class TrainingState:
     def __init__(self, config: Config, scene: Scene, device: torch.device, resuming: bool, engine: Engine) -> None:
         train = config.train
         self.config, self.engine, self.extent = config, engine, scene.extent
-        self.views = place_views(scene.train, device, train.photos_place)
-        self.maps = place_maps(self.views.cameras.sizes, device, train.maps_place, config.maps.beta, self.views.masks)
+        self.views = place_views(scene.train, device, train.pixels_place)
+        self.maps = place_maps(self.views.cameras.sizes, device, train.pixels_place, config.maps.beta, self.views.masks)
         self.background = Background.of(train.background, self.views.photos.transparent)
         self.exposures = first_exposures(scene, resuming, device) if train.exposure else None
         self.view_sampler = config.build("view_sampler")
