@@ -54,7 +54,7 @@ class RunOptions:
 
     def settings(self, scene: Path | None, overrides: tuple[str, ...]) -> Config:
         """The configuration that a command line asks for. `scene`: None leaves the capture open."""
-        from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config, require_one_length
+        from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
         from turbogs_plugin.plan.caps import with_cap
 
         if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
@@ -66,7 +66,6 @@ class RunOptions:
         more = [f"{name}={json.dumps(value)}" for name, value in given.items() if value is not None]
         asked = DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *more)
         settings = load_config(*asked)
-        require_one_length(asked[1])
         if self.max_gaussians is not None:
             settings = with_cap(settings, self.max_gaussians)
         if scene is not None:

@@ -62,9 +62,7 @@ def build_dataclass(cls: type[T], mapping: Any, where: str, also: Iterable[str] 
         raise InputError(f"{where}: {error}") from error
 
 
-_type_hints: Callable[[Any], dict[str, Any]] = cache(
-    typing.get_type_hints
-)  # each call evaluates every annotation of the class again
+_type_hints: Callable[[Any], dict[str, Any]] = cache(typing.get_type_hints)  # evaluates every annotation anew
 
 
 def dataclass_mapping(instance: Any) -> dict[str, Any]:
@@ -99,12 +97,9 @@ def convert(value: Any, hint: Any, where: str) -> Any:
         for argument in arguments:
             with suppress(InputError):
                 return convert(value, argument, where)
-    elif origin is list or (origin is tuple and arguments[-1] is Ellipsis):
+    elif origin in (tuple, list):
         if isinstance(value, tuple | list):
             return origin(convert(item, arguments[0], f"{where}[{place}]") for place, item in enumerate(value))
-    elif origin is tuple:
-        if isinstance(value, tuple | list) and len(value) == len(arguments):
-            return tuple(convert(item, kind, where) for item, kind in zip(value, arguments, strict=True))
     elif origin is dict:
         if isinstance(value, Mapping):
             return {_key(key, where): convert(item, arguments[1], f"{where}.{key}") for key, item in value.items()}
@@ -136,5 +131,5 @@ def _named(hint: Any) -> str:
     if origin is Literal:
         return " or ".join(map(str, arguments))
     if origin in (tuple, list):
-        return "a list, as [A, B]" if Ellipsis in arguments or origin is list else f"a list of {len(arguments)} values"
+        return "a list, as [A, B]"
     return NAMES.get(hint, "a mapping of keys")

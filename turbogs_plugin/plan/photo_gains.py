@@ -42,7 +42,6 @@ PATCHES_OF_A_PHOTO, PATCHES_AT_MOST = 400, 200_000
 LUMINANCE = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 ROUNDS, SMALLEST_RESIDUAL = 10, 0.01
 """Rounds of reweighted least squares, and the residual in stops below which all pairs weigh the same."""
-SOLVER_STEPS, SOLVED = 1000, 1e-6
 
 Floats = NDArray[np.floating]
 Integers = NDArray[np.integer]
@@ -137,41 +136,19 @@ def fit_gains(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> F
         weights: [E] > 0.
         count: V.
     """
+    from scipy.sparse import csr_matrix, diags
+    from scipy.sparse.linalg import lsqr
+
+    signs, rows = np.tile([1.0, -1.0], len(pairs)), np.repeat(np.arange(len(pairs)), 2)
+    differences = csr_matrix((signs, (rows, pairs.reshape(-1))), shape=(len(pairs), count))
     gains: Floats = np.zeros((count, 3))
     for _ in range(ROUNDS if len(pairs) else 0):
-        residuals = gains[pairs[:, 0]] - gains[pairs[:, 1]] - ratios
-        present = weights / np.maximum(SMALLEST_RESIDUAL, np.linalg.norm(residuals, axis=1))
-        gains = _least_squares(pairs, ratios, present, count)
+        residuals = np.linalg.norm(differences @ gains - ratios, axis=1)
+        roots = np.sqrt(weights / np.maximum(SMALLEST_RESIDUAL, residuals))  # [E]
+        weighted = diags(roots) @ differences
+        # Of all solutions the smallest, whose means are 0.
+        gains = np.stack([lsqr(weighted, roots * ratios[:, channel])[0] for channel in range(3)], axis=1)
     return gains
-
-
-def _least_squares(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> Floats:
-    """[V, 3] solution of the normal equations, a graph's Laplacian, by conjugate gradients: from 0 on, means stay 0."""
-
-    def towards(differences: Floats) -> Floats:
-        weighted = weights[:, None] * differences
-        return _summed(pairs, np.stack([weighted, -weighted], axis=1), count)
-
-    solution = np.zeros((count, 3))
-    residual = towards(ratios)
-    direction, size = residual, (residual**2).sum(axis=0)  # [V, 3], [3]
-    enough = SOLVED**2 * ((weights[:, None] * ratios) ** 2).sum(axis=0)
-    for _ in range(SOLVER_STEPS):
-        active = size > enough  # a channel that is solved stays as it is
-        if not active.any():
-            break
-        image = towards(direction[pairs[:, 0]] - direction[pairs[:, 1]])
-        step = np.divide(size, (direction * image).sum(axis=0), out=np.zeros(3), where=active)
-        solution, residual = solution + step * direction, residual - step * image
-        before, size = size, (residual**2).sum(axis=0)
-        direction = residual + np.divide(size, before, out=np.zeros(3), where=active) * direction
-    return solution
-
-
-def _summed(pairs: Integers, values: Floats, count: int) -> Floats:
-    """[V, 3] sums of [E, 2, 3] values over the places that [E, 2] pairs name."""
-    flat, rows = pairs.reshape(-1), values.reshape(-1, 3)
-    return np.stack([np.bincount(flat, rows[:, channel], minlength=count) for channel in range(3)], axis=1)
 
 
 def _compare(first: _Patches, second: _Patches) -> tuple[Floats, int]:
