@@ -11,8 +11,7 @@ from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.config.configuration import apply_overrides, config_names, load_config, resolve
 from turbogs_plugin.config.sections import AUTO_SETTINGS
 from turbogs_plugin.plan import SceneFacts
-from turbogs_plugin.plan.decisions import RULES
-from turbogs_plugin.plan.plan import plan_from_facts
+from turbogs_plugin.plan.decisions import RULES, plan_from_facts
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.study.results import StudyFolder
 from turbogs_plugin.train import run
@@ -31,8 +30,8 @@ FACTS = SceneFacts(
     photo_bytes=100 * MIB,
     map_bytes=120 * MIB,
     device="cuda",
-    device_free_bytes=1000 * MIB,
-    host_free_bytes=8000 * MIB,
+    device_bytes=1000 * MIB,
+    host_bytes=8000 * MIB,
 )
 ALL_AUTO = tuple(f"{setting}=auto" for setting in RULES)
 
@@ -81,11 +80,10 @@ BOTH_SIDES = [
     ("train.iterations", {"train_views": 2625, "processes": 2}, ("train.batch_for=auto",), 15000, "sampled 11.4 times"),
     ("train.iterations", {"train_views": 20}, ("train.epochs=75",), 2000, "take fewer than 2000, the least"),
     ("train.iterations", {"train_views": 43, "processes": 2}, ("train.batch_for=auto",), 1500, "fewer than 1414, the"),
-    ("train.pixels_place", {"device_free_bytes": 440 * MIB}, (), "device", "220 MiB <= 50% of 440 MiB free"),
-    ("train.pixels_place", {"device_free_bytes": 439 * MIB}, (), "host", "220 MiB > 50% of 439 MiB free"),
-    ("train.pixels_place", {"memory_limit": 439 * MIB}, (), "host", "220 MiB > 50% of 439 MiB allowed"),
-    ("train.pixels_place", {"device": "cpu", "device_free_bytes": MIB}, (), "device", "the device is the CPU"),
-    ("train.pixels_place", {"device": "cpu", "host_free_bytes": MIB}, (), "host", "120 MiB > 50% of 1 MiB free on"),
+    ("train.pixels_place", {"device_bytes": 440 * MIB}, (), "device", "220 MiB <= 50% of 440 MiB"),
+    ("train.pixels_place", {"device_bytes": 439 * MIB}, (), "host", "220 MiB > 50% of 439 MiB"),
+    ("train.pixels_place", {"device": "cpu", "device_bytes": MIB}, (), "device", "the device is the CPU"),
+    ("train.pixels_place", {"device": "cpu", "host_bytes": MIB}, (), "host", "120 MiB > 50% of 1 MiB free on"),
 ]
 
 
@@ -108,7 +106,7 @@ SET = [
     ("train.exposure", "true", {}, lambda config: config.train.exposure is True),
     ("train.batch_for", "2", {"processes": 2}, lambda config: config.schedule["pixel_budget"] == 1.0),
     ("train.iterations", "700", {"train_views": 250}, lambda config: config.train.refine_until == 3500),
-    ("train.pixels_place", "device", {"device_free_bytes": MIB}, lambda config: config.train.pixels_place == "device"),
+    ("train.pixels_place", "device", {"device_bytes": MIB}, lambda config: config.train.pixels_place == "device"),
 ]
 
 

@@ -55,7 +55,7 @@ class RunOptions:
     def settings(self, scene: Path | None, overrides: tuple[str, ...]) -> Config:
         """The configuration that a command line asks for. `scene`: None leaves the capture open."""
         from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
-        from turbogs_plugin.plan.caps import with_cap
+        from turbogs_plugin.plan.memory import with_cap
 
         if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
             raise InputError("scene.path is what SCENE says: leave the override out")

@@ -1,4 +1,5 @@
-"""One pure function a setting that may be ``auto``: facts and configuration -> what the setting should be, and why.
+"""The plan of a run: one pure function a setting that may be ``auto``, facts and configuration -> what the setting
+should be, and why; and the configuration that follows.
 
 Every criterion compares a number of the facts with a constant of this module, whose docstring says where it is from.
 """
@@ -9,14 +10,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from turbogs_plugin.config.configuration import Config
-from turbogs_plugin.config.scaling import RATE_EXPONENT
+import torch
+
+from turbogs_plugin.config.configuration import Config, resolve
+from turbogs_plugin.config.scaling import RATE_EXPONENT, with_batch_for, with_iterations
 from turbogs_plugin.config.sections import AUTO, WRITTEN_FOR, value_of
 from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.model.initial import BACKDROP_COUNT
-from turbogs_plugin.plan.caps import cap_of
-from turbogs_plugin.plan.facts import SceneFacts
-from turbogs_plugin.plan.memory import images_per_iteration
+from turbogs_plugin.plan.facts import SceneFacts, gather_facts
+from turbogs_plugin.plan.memory import cap_of, images_per_iteration
+from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.host_arrays import MEMORY_SHARE as HOST_SHARE
 
 ONE_SIDED = 0.95
@@ -170,16 +173,15 @@ def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
 def wanted_pixels_place(facts: SceneFacts, config: Config) -> Verdict:
     """Photos and maps on the device where they fit into a share of its memory; of a pixel, 3 bytes of photos and 4 of
     maps travel to the device each iteration otherwise, and 4 back."""
-    room = HOST_SHARE * facts.host_free_bytes
-    in_file = f"{HOST_SHARE:.0%} of {mebibytes(facts.host_free_bytes)} free on the host: maps in a file"
+    room = HOST_SHARE * facts.host_bytes
+    in_file = f"{HOST_SHARE:.0%} of {mebibytes(facts.host_bytes)} free on the host: maps in a file"
     if facts.device == "cpu":
         if facts.map_bytes > room:
             return "host", f"{mebibytes(facts.map_bytes)} > {in_file}"
         return "device", "the device is the CPU, whose memory is the host's"
-    limit = facts.device_free_bytes if facts.memory_limit is None else min(facts.device_free_bytes, facts.memory_limit)
     size = facts.photo_bytes + facts.map_bytes
-    fits, which = size <= DEVICE_SHARE * limit, "free" if limit == facts.device_free_bytes else "allowed"
-    reason = f"{mebibytes(size)} {'<=' if fits else '>'} {DEVICE_SHARE:.0%} of {mebibytes(limit)} {which}"
+    fits = size <= DEVICE_SHARE * facts.device_bytes
+    reason = f"{mebibytes(size)} {'<=' if fits else '>'} {DEVICE_SHARE:.0%} of {mebibytes(facts.device_bytes)}"
     return "device" if fits else "host", f"{reason}, > {in_file}" if not fits and facts.map_bytes > room else reason
 
 
@@ -202,3 +204,54 @@ RULES: dict[str, Callable[[SceneFacts, Config], Verdict]] = {
     "train.pixels_place": wanted_pixels_place,
 }
 """Setting that may be ``auto`` (`AUTO_SETTINGS`) -> its rule."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Facts and decisions, in the order in which they are printed."""
+
+    facts: SceneFacts
+    decisions: tuple[Decision, ...]
+
+    def apply(self, config: Config) -> Config:
+        """The configuration with everything decided: a plan of it changes nothing."""
+        made = {decision.setting: decision.value for decision in self.decisions if decision.made == "auto"}
+        if (batch := made.pop("train.batch_for", None)) is not None:
+            config = with_batch_for(config, int(batch))
+        if (iterations := made.pop("train.iterations", None)) is not None:
+            config = with_iterations(config, int(iterations))
+        mapping = config.to_mapping()
+        for setting, decided in made.items():
+            section, key = setting.split(".")
+            mapping[section][key] = decided
+        return resolve(mapping)
+
+    def text(self) -> str:
+        """For a terminal, and ``plan.txt`` of a run: a line a decision."""
+        name = max(len(decision.setting) for decision in self.decisions)
+        value = max(len(decision.text) for decision in self.decisions)
+        lines = [
+            f"  {decision.setting:<{name}} {decision.text:<{value}}  {decision.made:<4}  {decision.reason}"
+            for decision in self.decisions
+        ]
+        return "\n".join([f"plan for {self.facts.train_views} training views", *lines])
+
+
+def make_plan(config: Config, scene: Scene, device: torch.device, processes: int = 1) -> Plan:
+    """Look at scene and machine, and decide what the configuration leaves to decide, within its budgets.
+
+    Args:
+        config: what is ``auto`` in it is decided.
+        scene: loaded.
+        device: where training is to be.
+        processes: that will train one model together.
+    """
+    asked = config.train.exposure == AUTO
+    limit = config.budget.memory_bytes()
+    facts = gather_facts(scene, device, memory_limit=limit, processes=processes, with_exposures=asked)
+    return plan_from_facts(facts, config)
+
+
+def plan_from_facts(facts: SceneFacts, config: Config) -> Plan:
+    """The plan that these facts lead to."""
+    return Plan(facts, tuple(decide(setting, facts, config) for setting in RULES))

@@ -8,10 +8,12 @@ from torch import Tensor
 from turbogs_plugin.captures.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.exposures import Exposures
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points, with_degree
-from turbogs_plugin.plan.caps import cap_of, chosen_points, require_room
+from turbogs_plugin.plan.memory import cap_of
 from turbogs_plugin.plan.photo_gains import compare_exposures
 from turbogs_plugin.scene import PosedImages, Scene
+from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.train.saved_model import load_given
 from turbogs_plugin.types import Gaussians
 
@@ -40,10 +42,15 @@ def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
         On the CPU.
 
     Raises:
-        InputError: the given model cannot be read, or has more Gaussians than are allowed.
+        InputError: the given model cannot be read, or the cap has no room for it or for the backdrop.
     """
     train, cap = config.train, cap_of(config)
-    backdrop_count = BACKDROP_COUNT if train.backdrop else 0
+    others = BACKDROP_COUNT if train.backdrop else 0
+    if cap and cap <= others:
+        raise InputError(
+            f"density.max_gaussians {cap} leaves no room beside the {others} of the backdrop: allow more, or leave the "
+            "backdrop out by train.backdrop=false"
+        )
     if init in ("points", "random"):
         points, colors = scene.points, scene.point_colors
         if init == "random":
@@ -51,12 +58,16 @@ def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
             viewmats, Ks = cameras.viewmats.cpu().double().numpy(), cameras.Ks.cpu().double().numpy()
             points = torch.from_numpy(starting_points(viewmats, Ks, cameras.sizes)[0]).float()
             colors = colors_in_photos(points, scene.train.cameras, scene.train.photos, scene.train.masks)
-        rows = chosen_points(len(points), cap, backdrop_count)
+        rows = evenly(len(points), cap - others if cap else len(points))
         settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
         gaussians = gaussians_from_points(points[rows], colors[rows], *settings)
     else:
         gaussians = with_degree(load_given(init, scene, train.init_world), train.sh_degree)
-        require_room(init, len(gaussians), cap, backdrop_count)
+        if cap and len(gaussians) + others > cap:
+            raise InputError(
+                f"'{init}' has {len(gaussians)} Gaussians, more than density.max_gaussians {cap} allows beside "
+                f"{others} of a backdrop: allow more, or start from points"
+            )
     if not train.backdrop:
         return gaussians
     color = _mean_color(scene.train)
