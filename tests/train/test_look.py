@@ -37,20 +37,6 @@ def test_exposures_at_random_tell_nothing():
     assert told.norm() < 0.3 * noise[rows(TEST)].norm()
 
 
-def test_a_part_of_the_sequence_that_is_missing_is_told_as_far_as_such_parts_are():
-    """Each photo has .95 of the exposure before it: the next one tells it, and one that is 64 away does not."""
-    random, names = torch.Generator().manual_seed(0), [f"{number}.jpg" for number in range(1000)]
-    gains = torch.randn(1000, generator=random)
-    for number in range(1, 1000):
-        gains[number] = 0.95 * gains[number - 1] + 0.3 * gains[number]
-    exposures, missing = of(gains), range(400, 528)
-    trained = [number for number in range(1000) if number not in missing]
-    told = interpolated_exposures(exposures[trained], [names[n] for n in trained], [names[n] for n in missing])
-    lengths, wanted = told.flatten(1).norm(dim=1), exposures[trained].flatten(1).norm(dim=1)
-    assert (told[[0, -1]] - exposures[[400, 527]]).norm() < 0.5 * exposures[[400, 527]].norm()
-    assert lengths[[0, -1]].min() > 0.5 * wanted.mean() and lengths[56:72].max() < 0.1 * wanted.mean()
-
-
 @pytest.mark.parametrize("trained", [["a/1.jpg"], ["a/1.jpg", "a/2.jpg"], ["1.jpg", "2.jpg", "3.jpg"]])
 def test_without_neighbours_or_differences_it_is_the_identity(trained):
     offsets = torch.zeros(len(trained), 3, 4) if len(trained) == 3 else torch.ones(len(trained), 3, 4)

@@ -188,13 +188,6 @@ def test_a_resumed_run_is_held_to_its_memory(stopped, monkeypatch):
     assert run.resume(stopped).signal is None
 
 
-def test_a_run_of_a_gpu_is_not_told_to_resume_on_a_cpu(turbogs, stopped, monkeypatch):
-    change_config(stopped, train={"device": "cuda"})
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    code, _, error = turbogs("train", "--resume", stopped)
-    assert code == 2 and "go on with this run where there is a GPU" in error and "--device" not in error
-
-
 def test_memory_that_is_spent_names_what_may_fit(capture, tmp_path, monkeypatch):
     def full(trainer):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")

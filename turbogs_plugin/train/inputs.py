@@ -26,7 +26,9 @@ def resolve_device(name: str) -> torch.device:
     """The device of ``auto``, ``cpu`` or ``cuda``. Raises `InputError` if CUDA is asked for and absent."""
     if name == "cuda" and not torch.cuda.is_available():
         build = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
-        raise InputError(f"CUDA was asked for and is absent ({build}): see 'turbogs doctor', or begin with --device cpu")
+        raise InputError(
+            f"CUDA was asked for and is absent ({build}): see 'turbogs doctor', or begin with --device cpu"
+        )
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 

@@ -59,13 +59,14 @@ class RunFolder:
 
     def read_config(self) -> Config:
         """The resolved configuration of the run. Raises `InputError` if this is no run, or part of it is missing."""
-        if not self.config.is_file():
-            lacks = "config.yaml in it" if self.path.exists() else "such folder"
-            raise InputError(f"'{self.path}' holds no run: there is no {lacks}; give a folder that train --out made")
-        return resolve_complete(read_yaml(self.config), str(self.config), decided=True)
+        return self._read(self.config, decided=True)
 
     def read_asked(self) -> Config:
         """The configuration that was asked for. Raises `InputError` if it is missing or incomplete."""
-        if not self.asked.is_file():
-            raise InputError(f"'{self.path}' has no {self.asked.name}, which says what was asked for: train anew")
-        return resolve_complete(read_yaml(self.asked), str(self.asked))
+        return self._read(self.asked, decided=False)
+
+    def _read(self, file: Path, decided: bool) -> Config:
+        if not file.is_file():
+            lacks = f"{file.name} in it" if self.path.exists() else "such folder"
+            raise InputError(f"'{self.path}' holds no run: there is no {lacks}; give a folder that train --out made")
+        return resolve_complete(read_yaml(file), str(file), decided)
