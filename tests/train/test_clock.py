@@ -100,7 +100,7 @@ def test_the_device_starts_and_processes_connect_while_photos_are_read(capture, 
 
     monkeypatch.setattr(inputs, "load_and_find", lambda *a, **b: (together.wait(), load(*a, **b))[1])
     device = torch.device("cpu")
-    scene, started = inputs.open_started(tiny_config(capture, "train.device=cpu"), WallClock(), ranks=Noting())
+    scene, started = inputs.open_started(tiny_config(capture, "train.device=cpu"), WallClock(), Noting())
     assert len(scene.train) == 7 and started == device and met == [(device, False)]
     ProcessRanks.meet(None, device)  # uses nothing of the processes
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import torch
 
@@ -16,7 +15,6 @@ from turbogs_plugin.engine import compiled_kernels
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.clock import WallClock
-from turbogs_plugin.train.run_files import RunFolder
 
 PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
 """Parts of the wall time in which photos are decoded, and the device is then waited for."""
@@ -39,11 +37,10 @@ def show_loading(loaded: int, total: int) -> None:
         print(text, end="", file=sys.stderr, flush=True)
 
 
-def open_scene(config: Config, folder: RunFolder | None = None, ranks: Ranks = ONE) -> Scene:
+def open_scene(config: Config, ranks: Ranks = ONE) -> Scene:
     """The capture of a configuration. On a terminal, its photos are counted while they are decoded.
 
     Args:
-        folder: of the run with this configuration; None if the user names the capture.
         ranks: the processes that train together; each calls this. The first one refines cameras for all: machines
             differ in their last digits, and replicas may not.
 
@@ -51,25 +48,18 @@ def open_scene(config: Config, folder: RunFolder | None = None, ranks: Ranks = O
         InputError: there is no usable capture.
     """
     settings = config.scene
-    if folder is not None and not Path(settings.path).exists():
-        raise InputError(
-            f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
-            f"in {folder.config}"
-        )
     progress = show_loading if ranks.first else None
     scene, cameras = load_and_find(settings.path, settings.factor, settings.test_every, progress, find=ranks.first)
     return with_cameras(scene, ranks.agree(cameras), config.train.refine_cameras)
 
 
-def open_started(
-    config: Config, clock: WallClock, folder: RunFolder | None = None, ranks: Ranks = ONE
-) -> tuple[Scene, torch.device]:
+def open_started(config: Config, clock: WallClock, ranks: Ranks = ONE) -> tuple[Scene, torch.device]:
     """The capture, and the device with its kernels loaded: a thread starts it, in a second or more, while photos are
     decoded.
 
     Args:
         clock: of the wall, on which `PHOTOS` and `DEVICE` are marked.
-        folder, ranks: as for `open_scene`. Where one process ends before, the others wait until their launcher ends
+        ranks: as for `open_scene`. Where one process ends before, the others wait until their launcher ends
             them.
 
     Raises:
@@ -86,7 +76,7 @@ def open_started(
 
     with ThreadPoolExecutor(1) as pool:
         started = pool.submit(start)
-        scene = open_scene(config, folder, ranks)
+        scene = open_scene(config, ranks)
         clock.mark(PHOTOS)
         device = started.result()
     clock.mark(DEVICE)

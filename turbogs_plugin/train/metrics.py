@@ -20,7 +20,6 @@ from torch import Tensor
 
 from turbogs_plugin.device import peak_memory_bytes, synchronize
 from turbogs_plugin.engine.render import render_image
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.history import MEASURES, Evaluation, FurtherErrors
 from turbogs_plugin.train.look import Look
@@ -208,9 +207,6 @@ def load_lpips(device: torch.device) -> tuple[ImageError | None, str]:
 
     Returns:
         The function, or None; and the reason for None.
-
-    Raises:
-        InputError: the file in the cache does not hold the weights.
     """
     missing = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
@@ -221,10 +217,7 @@ def load_lpips(device: torch.device) -> tuple[ImageError | None, str]:
         return None, f"there are no weights of VGG16 on this machine: put torchvision's file at {weights}"
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
-    try:
-        network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to(device)
-    except (RuntimeError, OSError, KeyError, EOFError) as error:
-        raise InputError(f"'{weights}' does not hold VGG16's weights ({error}): remove it, or put them there") from None
+    network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to(device)
     return lambda image, photo: network(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]).item(), ""
 
 

@@ -133,7 +133,7 @@ def train(
     if posed != config.scene.path:
         clock.mark(CAMERAS)
         config = replace(config, scene=replace(config.scene, path=posed))
-    scene, device = open_started(config, clock, ranks=ranks)
+    scene, device = open_started(config, clock, ranks)
     plan = make_plan(config, scene, device, ranks.count)
     clock.mark("plan")
     remedy = "use train.pixels_place=host, --max-gaussians or a larger --factor"
@@ -176,7 +176,7 @@ def resume(
         raise InputError(f"'{path}' is finished and has no checkpoint to go on from: use its {folder.model.name}")
     state = None if checkpoint is None else load_checkpoint(checkpoint)
     require_writable(folder.path, f"what --resume {folder.path} writes")
-    scene, device = open_started(config, clock, folder, ranks)
+    scene, device = open_started(config, clock, ranks)
     hold_to_limit(config, device)
     with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
         resuming = state is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
 from turbogs_plugin.config.configuration import Config, resolve_complete
@@ -36,13 +35,8 @@ class RunFolder:
 
     def require_new(self) -> None:
         """Raise `InputError` if the folder holds anything, or cannot be made."""
-        if self.config.exists():
-            quoted = shlex.quote(str(self.path))
-            raise InputError(f"'{self.path}' holds another run: choose a new --out, or go on with --resume {quoted}")
-        if self.path.exists() and not self.path.is_dir():
-            raise InputError(f"--out '{self.path}' is a file: choose a folder")
-        if self.path.is_dir() and any(self.path.iterdir()):
-            raise InputError(f"--out '{self.path}' is not empty: choose a new folder")
+        if self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir())):
+            raise InputError(f"--out '{self.path}' is not empty: choose a new folder, or go on with a run by --resume")
         require_writable(self.path, f"--out '{self.path}'")
 
     def finished(self, reported: bool) -> bool:

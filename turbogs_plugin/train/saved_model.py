@@ -112,7 +112,7 @@ def load_with_capture(
         return SavedModel(None, given, gaussians, scene.frame, None), scene, ""
     model = load_model(path, device)
     try:
-        return model, open_scene(model.config, model.folder), ""
+        return model, open_scene(model.config), ""
     except InputError as error:
         if needed:
             raise
