@@ -64,10 +64,10 @@ BOTH_SIDES = [
     ("train.dropout", {"reprojection_error": 0.39}, (), 0.0, "points 0.39 pixels from where photos show them < 0.4"),
     ("train.dropout", {}, (), 0.0, "no reconstruction says how accurate the cameras are"),
     ("train.batch_for", {}, (), 1, "one process"),
-    ("train.batch_for", {"processes": 2}, (), 2, "2 processes"),
-    ("train.batch_for", {"processes": 4}, (), 2, "4 processes, of which a batch for 2 costs no error"),
-    ("train.batch_for", {"processes": 2, "train_views": 19}, (), 1, "2 processes, but 2 times 10 views > 19 training"),
-    ("train.batch_for", {"processes": 2, "train_views": 500}, ("schedule.max_views=65",), 1, "> an iteration's 128"),
+    ("train.batch_for", {"processes": 2}, (), 2, "2 processes; a batch for 2 costs"),
+    ("train.batch_for", {"processes": 4}, (), 2, "4 processes; a batch for 2 costs no error"),
+    ("train.batch_for", {"processes": 2, "train_views": 19}, (), 1, "2 processes, but 2 times 10 views > 19"),
+    ("train.batch_for", {"processes": 2, "train_views": 500}, ("schedule.max_views=65",), 1, "views > 128"),
     ("train.batch_for", {"processes": 2}, ("schedule.type=fixed", "schedule.views=60"), 1, "2 times 60 views > 100"),
     ("train.iterations", {"train_views": 100, "processes": 2}, ("train.batch_for=2",), 6000, "60 epochs"),
     ("train.iterations", {"train_views": 100, "processes": 2}, ("train.batch_for=auto",), 3000, "2 times the pixels"),
@@ -95,7 +95,7 @@ def test_the_number_that_decides(setting, changes, overrides, value, number):
 
 
 def test_every_setting_that_may_be_auto_has_both_sides_above():
-    assert {case[0] for case in BOTH_SIDES} == set(RULES) == set(AUTO_SETTINGS)
+    assert {case[0] for case in BOTH_SIDES} == set(RULES) == {f"train.{name}" for name in AUTO_SETTINGS}
     for setting in RULES:
         assert len({case[3] for case in BOTH_SIDES if case[0] == setting}) > 1, setting
 

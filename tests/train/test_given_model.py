@@ -235,7 +235,7 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         "a list": (saved("list.pt", [torch.zeros(3)]), "it has list): give a .ply"),
         "code": (saved("code.pt", {"splats": Path("x")}), "more than plain tensors"),
         "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
-        "no rows": (save_splats(folder / "none.pt", model.map(lambda value: value[:0])), "holds no Gaussians: export"),
+        "no rows": (save_splats(folder / "none.pt", model.map(lambda value: value[:0])), "holds 0 Gaussians"),
         "not a ply": (written("text.ply", b"text"), "not a .ply file"),
         "not a spz": (written("text.spz", b"text"), "cannot read"),
     }

@@ -20,7 +20,6 @@ from turbogs_plugin.config.components import KINDS, build, default_type, strateg
 from turbogs_plugin.config.sections import (
     AUTO,
     AUTO_SETTINGS,
-    WRITTEN_FOR,
     BudgetConfig,
     MapsConfig,
     ReportConfig,
@@ -76,12 +75,9 @@ class Config:
 
     def without_plan(self) -> Config:
         """This configuration, decided for a run that looks at neither scene nor machine, such as a benchmark."""
-        mapping = self.to_mapping()
-        for setting in undecided(mapping):
-            section, key = setting.split(".")
-            value = AUTO_SETTINGS[setting]
-            mapping[section][key] = WRITTEN_FOR if value is None else value
-        return resolve(mapping)
+        decided = vars(TrainConfig(pixels_place="device"))  # the defaults
+        left = {name: decided[name] for name in AUTO_SETTINGS if getattr(self.train, name) == AUTO}
+        return self.changed(train=left)
 
     def changed(self, **sections: Mapping[str, Any]) -> Config:
         """This configuration with values of some sections replaced; a section with a `type` starts afresh."""

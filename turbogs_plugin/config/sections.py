@@ -23,17 +23,9 @@ LONGEST_TIME = 100 * 3600.0
 Auto = Literal["auto"]
 """The type of `AUTO`."""
 
-AUTO_SETTINGS: dict[str, Any] = {
-    "train.backdrop": False,
-    "train.background": "black",
-    "train.exposure": False,
-    "train.dropout": 0.0,
-    "train.batch_for": 1,
-    "train.iterations": None,
-    "train.pixels_place": "device",
-}
-"""Setting that may be ``auto`` -> its value if no plan is made; None: `WRITTEN_FOR`. What a plan makes of ``auto`` is
-decided in `turbogs_plugin.plan.decisions`. `train.device` is not among them, as a plan is made for a given device."""
+AUTO_SETTINGS = ("backdrop", "background", "exposure", "dropout", "batch_for", "iterations", "pixels_place")
+"""Settings of the section `train` that may be ``auto``; what a plan makes of it: `turbogs_plugin.plan.decisions`.
+`device` is not among them, as a plan is made for a given device."""
 
 STRIPS = 8
 """Test views that a report, and TensorBoard, show as pictures, at most."""
@@ -230,14 +222,8 @@ class BudgetConfig:
 
 
 def undecided(mapping: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The settings of a complete configuration that are left to a plan."""
-    return [setting for setting in AUTO_SETTINGS if value_of(mapping, setting) == AUTO]
-
-
-def value_of(mapping: Mapping[str, Mapping[str, Any]], setting: str) -> Any:
-    """The value of ``section.key``."""
-    section, key = setting.split(".")
-    return mapping[section][key]
+    """The settings of a complete configuration that are left to a plan, ``section.key``."""
+    return [f"train.{name}" for name in AUTO_SETTINGS if mapping["train"][name] == AUTO]
 
 
 BYTE_UNITS = {"": 1, "b": 1, "kib": 2**10, "mib": 2**20, "gib": 2**30, "kb": 10**3, "mb": 10**6, "gb": 10**9}

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from turbogs_plugin.model.gsplat_file import read_gsplat, save_gsplat
 from turbogs_plugin.model.ply import read_ply, save_ply
@@ -14,15 +14,10 @@ from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.types import Gaussians
 
 
-@dataclass(frozen=True)
-class Format:
-    """A format of files.
-
-    Args:
-        write: is given the model, the new file, the frame of the model's coordinates, and the iterations of its
-            training. The file is written whole or not at all.
-        read: the model in float64, in the file's own coordinates.
-    """
+class Format(NamedTuple):
+    """A format of files. `write` is given the model, the new file, the frame of the model's coordinates and the
+    iterations of its training, and writes the file whole or not at all; `read` gives the model in float64, in the
+    file's own coordinates."""
 
     write: Callable[[Gaussians, Path, Frame, int], None]
     read: Callable[[Path], Gaussians]

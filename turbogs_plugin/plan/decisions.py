@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import torch
 
-from turbogs_plugin.config.configuration import Config, resolve
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import RATE_EXPONENT, with_batch_for, with_iterations
-from turbogs_plugin.config.sections import AUTO, WRITTEN_FOR, value_of
+from turbogs_plugin.config.sections import AUTO, WRITTEN_FOR
 from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.plan.facts import SceneFacts, gather_facts
@@ -50,8 +50,6 @@ SHORTEST_SHARE = 0.4
 Several processes, whose steps are longer by the root of their number, need fewer by that root."""
 
 Value = bool | int | float | str
-
-
 Verdict = tuple[Value, str]
 """A setting's value by the facts, and the reason, with the number that decides."""
 
@@ -72,15 +70,10 @@ class Decision:
     made: str
     reason: str
 
-    @property
-    def text(self) -> str:
-        """The value as YAML has it."""
-        return yaml_text(self.value)
-
 
 def decide(setting: str, facts: SceneFacts, config: Config) -> Decision:
     """A setting's value in a run: by the configuration or, where that is ``auto``, by the facts."""
-    present, (value, reason) = value_of(config.to_mapping(), setting), RULES[setting](facts, config)
+    present, (value, reason) = getattr(config.train, setting.removeprefix("train.")), RULES[setting](facts, config)
     if present == AUTO:
         return Decision(setting, value, "auto", reason)
     return Decision(setting, present, "set", f"auto: {yaml_text(value)}, {reason}")
@@ -116,7 +109,7 @@ def wanted_exposure(facts: SceneFacts, config: Config) -> Verdict:
     if facts.exposure_views is None:
         return False, "unless the photos' exposures say otherwise, which only auto compares"
     if 2 * facts.exposure_views < facts.train_views:
-        return (False, f"only {facts.exposure_views} of {facts.train_views} photos could be compared")
+        return False, f"only {facts.exposure_views} of {facts.train_views} photos could be compared"
     spread, rest = facts.exposure_spread, facts.exposure_rest
     differ, told = spread >= EXPOSURE_STOPS, rest <= EXPOSURE_SHARE * spread
     reason = f"photos {spread:.2f} stops apart {_sign(differ)} {EXPOSURE_STOPS}"
@@ -144,11 +137,9 @@ def wanted_batch_for(facts: SceneFacts, config: Config) -> tuple[int, str]:
         return 1, "one process" if count == 1 else "the schedule has no number of views"
     wanted = min(count, LARGEST_BATCH)
     fitting = max(1, min(wanted, min(views, MAX_VIEWS) // most))
-    reason = f"{count} processes" + (f", of which a batch for {wanted} costs no error" if wanted < count else "")
     if fitting < wanted:
-        bound = f"an iteration's {MAX_VIEWS}" if views > MAX_VIEWS else f"{views} training views"
-        reason += f", but {fitting + 1} times {most} views > {bound}"
-    return fitting, reason
+        return fitting, f"{count} processes, but {fitting + 1} times {most} views > {min(views, MAX_VIEWS)}"
+    return fitting, f"{count} processes; a batch for {LARGEST_BATCH} costs no error"
 
 
 def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
@@ -220,18 +211,14 @@ class Plan:
             config = with_batch_for(config, int(batch))
         if (iterations := made.pop("train.iterations", None)) is not None:
             config = with_iterations(config, int(iterations))
-        mapping = config.to_mapping()
-        for setting, decided in made.items():
-            section, key = setting.split(".")
-            mapping[section][key] = decided
-        return resolve(mapping)
+        return config.changed(train={name.removeprefix("train."): value for name, value in made.items()})
 
     def text(self) -> str:
         """For a terminal, and ``plan.txt`` of a run: a line a decision."""
         name = max(len(decision.setting) for decision in self.decisions)
-        value = max(len(decision.text) for decision in self.decisions)
+        value = max(len(yaml_text(decision.value)) for decision in self.decisions)
         lines = [
-            f"  {decision.setting:<{name}} {decision.text:<{value}}  {decision.made:<4}  {decision.reason}"
+            f"  {decision.setting:<{name}} {yaml_text(decision.value):<{value}}  {decision.made:<4}  {decision.reason}"
             for decision in self.decisions
         ]
         return "\n".join([f"plan for {self.facts.train_views} training views", *lines])

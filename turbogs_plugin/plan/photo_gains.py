@@ -154,17 +154,12 @@ def fit_gains(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> F
 def _compare(first: _Patches, second: _Patches) -> tuple[Floats, int]:
     """[3] median of first over second, in stops, and the number of patches behind it; 0 where these are too few."""
     _, here, there = np.intersect1d(first.points, second.points, assume_unique=True, return_indices=True)
-    ours, others = first.shapes[here], second.shapes[there]
-    alike = _alike(ours, others)
-    by_chance = _alike(ours, np.roll(others, len(others) // 2, axis=0))  # of different points
+    ours, others = first.shapes[here], second.shapes[there]  # [n, 25]
+    others_of = np.roll(others, len(others) // 2, axis=0)  # of different points
+    alike, by_chance = ((ours * each).sum(axis=1) >= LIKENESS for each in (others, others_of))  # [n]
     if alike.sum() < max(FEWEST_MATCHES, TIMES_CHANCE * by_chance.sum()):
         return np.zeros(3), 0
     return np.median(first.stops[here[alike]] - second.stops[there[alike]], axis=0), int(alike.sum())
-
-
-def _alike(first: Floats, second: Floats) -> NDArray[np.bool_]:
-    """[n] whether two shapes [n, 25] show the same."""
-    return (first * second).sum(axis=1) >= LIKENESS
 
 
 def _sight(views: PosedImages, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -136,8 +136,7 @@ def train(
     scene, device = open_started(config, clock, ranks)
     plan = make_plan(config, scene, device, ranks.count)
     clock.mark("plan")
-    remedy = "use train.pixels_place=host, --max-gaussians or a larger --factor"
-    with _fitting(scene, remedy):
+    with _fitting(scene):
         loop = new_loop(_independent(plan.apply(config), device), scene, device, ranks)
         session = RunSession(folder, scene, loop, clock)
     if ranks.first:
@@ -178,7 +177,7 @@ def resume(
     require_writable(folder.path, f"what --resume {folder.path} writes")
     scene, device = open_started(config, clock, ranks)
     hold_to_limit(config, device)
-    with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
+    with _fitting(scene):
         resuming = state is not None
         trainer = Trainer(config, scene, device, resuming, ranks.engine(device))
         loop = TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), ranks=ranks)
@@ -200,8 +199,9 @@ def _posed_capture(config: Config, out: Path) -> str:
 
 
 @contextmanager
-def _fitting(scene: Scene, remedy: str) -> Iterator[None]:
+def _fitting(scene: Scene) -> Iterator[None]:
     """Turn a lack of device memory before training into an `InputError` that names a remedy."""
+    remedy = "use train.pixels_place=host, --max-gaussians or a larger --factor, or end what else is in that memory"
     try:
         yield
     except torch.cuda.OutOfMemoryError:
