@@ -61,7 +61,7 @@ def gather_facts(
     """The facts of a scene, to be trained on a device.
 
     Args:
-        scene: on any device; photos that are already on `device` count as free memory, for they are planned here.
+        scene: in host memory.
         device: where training is to be.
         memory_limit: bytes of the device that must not be exceeded.
         processes: that will train together.
@@ -71,7 +71,10 @@ def gather_facts(
     pixels, test_pixels = (int(part.cameras.sizes.prod(axis=1).sum()) for part in (scene.train, scene.test))
     gains = compare_exposures(views, scene.points) if with_exposures else None
     host_free = free_host_bytes()
-    free = _free_device_bytes(device, scene) if device.type == "cuda" else host_free
+    free = host_free
+    if device.type == "cuda":
+        free = torch.cuda.mem_get_info(device)[0]
+        free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     return SceneFacts(
         train_views=len(views),
         direction_concentration=float(views.cameras.directions.double().mean(dim=0).norm()),
@@ -87,10 +90,3 @@ def gather_facts(
         exposure_views=int(gains.compared.sum()) if gains else None,
         reprojection_error=scene.reprojection_error,
     )
-
-
-def _free_device_bytes(device: torch.device, scene: Scene) -> int:
-    free, _ = torch.cuda.mem_get_info(device)
-    free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    ours = (views.photos.stored for views in (scene.train, scene.test))
-    return free + sum(colors.numel() for colors in ours if colors.device.type == "cuda")

@@ -53,24 +53,16 @@ class PhotoGains:
 
     Args:
         gains: [V, 3] float64 of the channels; their mean over what is compared is 0.
-        left: [V, 3] float64, the gains less what the photos before and after tell (`turbogs_plugin.scene.sequence`).
         compared: [V] bool, photos that share enough with another one; the others' gains are 0.
+        spread: standard deviation of the gains of what is compared.
+        rest: standard deviation of these from the gains of the photos before and after (`scene.sequence`). A camera's
+            automatic that follows the light leaves little; exposures at random leave more than there was.
     """
 
     gains: Floats
-    left: Floats
     compared: NDArray[np.bool_]
-
-    @property
-    def spread(self) -> float:
-        """Standard deviation of the gains."""
-        return _deviation(self.gains[self.compared])
-
-    @property
-    def rest(self) -> float:
-        """Standard deviation of the gains from the gains of the photos before and after. A camera's automatic that
-        follows the light leaves little; exposures at random leave more than there was."""
-        return _deviation(self.left[self.compared])
+    spread: float
+    rest: float
 
 
 @dataclass(frozen=True)
@@ -119,10 +111,9 @@ def compare_exposures(views: PosedImages, points: Tensor) -> PhotoGains:
     gains = fit_gains(pairs, np.array(list(kept.values()), dtype=np.float64).reshape(-1, 3), weights, count)
     compared = np.bincount(pairs.reshape(-1), minlength=count) > 0  # [V]
     names = [name for name, told in zip(views.names, compared, strict=True) if told]
-    left = gains.copy()
-    near = PhotoOrder(views.names).neighbours(names, names)
-    left[compared] -= near.mean(torch.from_numpy(gains[compared])).numpy()
-    return PhotoGains(gains, left, compared)
+    among, near = gains[compared], PhotoOrder(views.names).neighbours(names, names)
+    rest = among - near.mean(torch.from_numpy(among)).numpy()
+    return PhotoGains(gains, compared, _deviation(among), _deviation(rest))
 
 
 def fit_gains(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> Floats:
