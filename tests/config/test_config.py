@@ -72,22 +72,16 @@ BAD_OVERRIDES = [
     ("trian.iterations=5", ["trian", "did you mean 'train'?"]),
     ("schedule.type=sinus", ["sinus", "did you mean 'sinusoidal'?", "fixed"]),
     ("optimizer.learning_rates.mean=1", ["learning_rates.mean", "did you mean 'means'?"]),
-    ("optimizer.eps=1", ["optimizer.eps"]),
     ("schedule.min_views=20", ["max_views", "10", "20"]),
     ("optimizer.learning_rates.means=-1", ["means", "-1"]),
     ("train.iterations=2147483648", ["iterations", "2147483648"]),
     ("train.iterations=many", ["train.iterations", "whole number", "auto", "many"]),
-    ("train.iterations=true", ["train.iterations", "whole number"]),
     ("maps.beta=fast", ["maps.beta", "number"]),
-    ("maps.beta=2", ["beta", "2"]),
     ("train.evaluate_at=0.5", ["train.evaluate_at", "list"]),
-    ("train.evaluate_at=[0.5, 2]", ["evaluate_at", "2"]),
     ("density.split=middle", ["density.split", "sample", "long_axis"]),
     ("budget.time=1000000h", ["time", "at most 100h"]),
     ("train..seed=1", ["section.key=value"]),
-    ("train.seed.x=1", ["train.seed"]),
     ("train.device=tpu", ["device", "tpu", "cuda"]),
-    ("scene.factor=0", ["factor", "0"]),
     ("train.seed=1\nother: 2", ["more than one value"]),
 ]
 
@@ -98,11 +92,6 @@ def test_a_bad_override_is_named(override, words):
         load_config("turbogs", [override])
     for word in words:
         assert word in str(error.value)
-
-
-def test_an_unknown_name_lists_the_known():
-    with pytest.raises(InputError, match=r"did you mean 'turbogs'\?.*turbogs-big"):
-        load_config("turbo")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import torch
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
-from turbogs_plugin.model.similarity import Similarity, in_capture
+from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.model.spz import packed
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.types import SH_C0, Gaussians
@@ -105,16 +105,6 @@ def test_a_damaged_spz_is_refused(tmp_path, damage):
     file.write_bytes({"cut": content[:-5], "longer": content[:40] + b"abc" + content[40:], "other": b"ply\nno"}[damage])
     with pytest.raises(InputError, match=file.name):
         FORMATS["spz"].read(file)
-
-
-def test_gaussians_that_are_not_finite_are_left_out():
-    made = gaussians(10)
-    made.scales[3, 1] = torch.inf
-    with pytest.warns(UserWarning, match="1 of 10 Gaussians are not finite"):
-        assert len(in_capture(made, Frame(np.zeros(3), 1.0), Path("x"))) == 9
-    made.means[:] = torch.nan
-    with pytest.warns(UserWarning), pytest.raises(InputError, match="no Gaussians"):
-        in_capture(made, Frame(np.zeros(3), 1.0), Path("x"))
 
 
 def test_a_single_gaussian_and_one_place(tmp_path):

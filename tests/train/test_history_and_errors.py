@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,9 +10,9 @@ import pytest
 import torch
 
 from turbogs_plugin.device import peak_memory_bytes
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.train import metrics
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
-from turbogs_plugin.train.metrics import Metrics, ViewMetrics, compare, psnr, ssim
+from turbogs_plugin.train.metrics import Metrics, ViewMetrics, compare, load_lpips, psnr, ssim
 from turbogs_plugin.train.progress import TrainingProgress
 
 FIELDS = {"iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians", "memory_bytes"}
@@ -43,17 +44,6 @@ def test_nan_is_null(tmp_path):
     assert math.isnan(read_history(tmp_path / "h")[0].ssim)
 
 
-def test_a_line_cut_short_is_left_out_and_a_wrong_one_is_named(tmp_path):
-    path = tmp_path / "history.jsonl"
-    append_evaluation(path, evaluation(1))
-    whole = path.read_text()
-    path.write_text(whole + whole[:20])
-    assert read_history(path) == [evaluation(1)]
-    path.write_text("nonsense\n" + whole)
-    with pytest.raises(InputError, match="line 1"):
-        read_history(path)
-
-
 def test_a_resumed_run_says_the_rest_again(tmp_path):
     path = tmp_path / "history.jsonl"
     for iteration in (0, 10, 20, 30):
@@ -66,10 +56,10 @@ def test_errors_of_an_image_by_numpy():
     generator = torch.Generator().manual_seed(0)
     photo = torch.rand(24, 20, 3, generator=generator)
     image = (photo + 0.1 * torch.randn(24, 20, 3, generator=generator)).clamp(0, 1)
-    metrics = compare("view", image, photo)
+    measured = compare("view", image, photo)
     difference = image.double().numpy() - photo.double().numpy()
-    assert metrics.psnr == pytest.approx(-10 * np.log10((difference**2).mean()), abs=1e-4)
-    assert metrics.l1 == pytest.approx(np.abs(difference).mean(), abs=1e-6)
+    assert measured.psnr == pytest.approx(-10 * np.log10((difference**2).mean()), abs=1e-4)
+    assert measured.l1 == pytest.approx(np.abs(difference).mean(), abs=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(11, 11), (24, 20), (40, 64)])
@@ -117,3 +107,28 @@ def test_progress_is_a_bar_on_a_terminal(capsys, monkeypatch):
         progress.advanced(training(50, 1234))
     shown = capsys.readouterr().err
     assert all(part in shown for part in ("50/100", "PSNR 20.10 dB", "1,234 Gaussians", "it/s"))
+
+
+def test_lpips_takes_the_weights_of_torchs_cache_and_says_what_is_missing(tmp_path, monkeypatch):
+    class Network(torch.nn.Module):
+        def __init__(self, **_) -> None:
+            super().__init__()
+
+        def forward(self, image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
+            assert image.shape == photo.shape == (1, 3, 4, 5)
+            return (image - photo).abs().mean()
+
+    module = SimpleNamespace(LearnedPerceptualImagePatchSimilarity=Network)
+    monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", module)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(metrics, "LPIPS_PACKAGES", ("torch", "no_such_package"))
+    assert load_lpips(torch.device("cpu"))[1].startswith(
+        "it needs no_such_package: pip install no_such_package torch=="
+    )
+    monkeypatch.setattr(metrics, "LPIPS_PACKAGES", ())
+    function, reason = load_lpips(torch.device("cpu"))
+    assert function is None and f"put torchvision's file at {tmp_path}" in reason
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints/vgg16-397923af.pth").touch()
+    function, reason = load_lpips(torch.device("cpu"))
+    assert function(torch.ones(4, 5, 3), torch.zeros(4, 5, 3)) == 1.0 and reason == ""

@@ -24,8 +24,8 @@ from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.fingerprint import capture_difference, capture_state
 from turbogs_plugin.config.configuration import Config, load_config, resolve
 from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.files import require_writable
 from turbogs_plugin.model.ply import load_ply
-from turbogs_plugin.model.row_order import spatial_order
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.strategies.protocols import PixelSampler, SparseLoss
 from turbogs_plugin.train import run
@@ -172,7 +172,7 @@ def test_sigterm_before_training_ends_the_process_without_a_trace(capture):
         "import os, signal, sys; from turbogs_plugin.captures import load_scene\n"
         "load_scene(sys.argv[1]); os.kill(os.getpid(), signal.SIGTERM)"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(capture)], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code, str(capture)], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, "", "")
 
 
@@ -207,18 +207,6 @@ def test_a_model_without_gaussians_ends_the_run_with_a_reason(capture, tmp_path,
     stop_after(monkeypatch, 7, all_gone)
     with pytest.raises(TrainingStopped, match=r"iteration 7: .*every Gaussian.*iteration-000005\.pt"):
         run.train(tiny_config(capture), tmp_path / "run")
-
-
-def test_rows_are_in_the_order_of_space_whatever_added_them(capture):
-    trainer = Trainer(tiny_config(capture).without_plan(), load_scene(capture), torch.device("cpu"))
-    count = len(trainer.gaussians)
-    trainer.initialise_maps()
-    while len(trainer.gaussians) == count:
-        trainer.step()
-    rows = torch.arange(len(trainer.gaussians))
-    assert len(rows) > count
-    assert torch.equal(spatial_order(trainer.gaussians.means, trainer.extent), rows)
-    assert len(trainer.density.stats.weight_sums) == len(rows)
 
 
 def test_non_finite_losses_are_counted(capture, tmp_path, monkeypatch):
@@ -367,3 +355,26 @@ def test_what_a_strategy_of_ones_own_returns_is_refused_and_nothing_is_left(
     with pytest.raises(InputError, match=message):
         run.train(tiny_config(capture, "schedule.min_views=3", "view_sampler.type=random"), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_not_resumed(capture, tmp_path, monkeypatch):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.yaml").write_text(tiny_config(capture).without_plan().to_yaml())
+
+    def refused(folder: Path, given: str) -> None:
+        require_writable(folder / "config.yaml" / "file", given)  # whoever runs this may write to any folder
+
+    monkeypatch.setattr(run, "require_writable", refused)
+    with pytest.raises(InputError, match=r"what --resume .*run writes cannot be made in .*: choose a folder"):
+        run.resume(tmp_path / "run")
+
+
+SHORT = ("train.iterations=2", "train.refine_until=1", "train.device=cpu")
+
+
+def test_a_folder_is_read_as_the_section_scene_says(capture):
+    models = [run.fit(given, *SHORT, "scene.factor=2") for given in (str(capture), capture, load_scene(capture, 2))]
+    whole = run.fit(load_scene(capture), *SHORT)
+    for name, value in models[2].items():
+        assert all(torch.equal(getattr(model, name), value) for model in models[:2])
+    assert not torch.equal(whole.sh0, models[0].sh0)
