@@ -76,27 +76,6 @@ def test_it_is_the_mean_of_what_was_added():
     torch.testing.assert_close(mean.tensors, tensors(5.0, rows=7))
 
 
-def test_it_goes_into_another_trainers_parameters():
-    """gsplat has a dictionary of parameters, whose rows its strategies change."""
-    splats = torch.nn.ParameterDict(tensors(1.0))
-    mean = ParameterMean(0.5, splats)
-    mean.add(splats)
-    splats = torch.nn.ParameterDict(tensors(4.0, rows=3))
-    for value in (4.0, 8.0):
-        for parameter in splats.values():
-            parameter.data = parameter.data.sign() * value
-        mean.add(splats)
-    parameter = splats["means"]
-    mean.overwrite(splats)
-    assert splats["means"] is parameter and parameter.requires_grad and mean.count == 0
-    torch.testing.assert_close(dict(splats), tensors(6.0, rows=3), check_stride=False)
-    mean.overwrite(splats)  # none is there
-    torch.testing.assert_close(dict(splats), tensors(6.0, rows=3))
-    mean.add(splats)
-    with pytest.raises(RuntimeError, match="size"):
-        mean.overwrite(tensors(0.0, rows=7))
-
-
 def test_the_lines_of_the_documentation():
     """docs/drop-in.md, in a loop as gsplat's."""
     page = (Path(__file__).parents[2] / "docs/drop-in.md").read_text()
