@@ -10,8 +10,8 @@ import torch
 from packaging.requirements import Requirement
 
 from turbogs_plugin.engine import compiled_kernels
+from turbogs_plugin.report.evaluation import LPIPS_PACKAGES
 from turbogs_plugin.report.provenance import hardware, missing_bytecode, software
-from turbogs_plugin.train.metrics import LPIPS_PACKAGES
 from turbogs_plugin.viewer.server import INSTALL as INSTALL_VIEWER
 
 REQUIREMENTS = (

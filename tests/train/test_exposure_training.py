@@ -10,12 +10,13 @@ from PIL import Image
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.render import render_image
+from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.export.renders import render_run
 from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from turbogs_plugin.train.history import read_history
-from turbogs_plugin.train.look import exposed, interpolated_exposures
+from turbogs_plugin.train.look import Look, interpolated_exposures
 from turbogs_plugin.train.metrics import evaluate, render_view
 from turbogs_plugin.train.run import train
 from turbogs_plugin.train.trainer import Trainer
@@ -170,7 +171,8 @@ def test_without_neighbours_or_differences_it_is_the_identity(trained):
 
 def test_exposed_is_the_affine_map_of_each_colour():
     random = torch.Generator().manual_seed(2)
-    colors, exposure = torch.rand(4, 5, 3, generator=random), torch.randn(3, 4, generator=random)
+    colors, exposure = torch.rand(4, 5, 3, generator=random), 0.3 * torch.randn(3, 4, generator=random)
     wanted = [color + exposure[:, :3] @ color + exposure[:, 3] for color in colors.reshape(-1, 3)]
-    torch.testing.assert_close(exposed(colors, exposure).reshape(-1, 3), torch.stack(wanted))
-    assert (exposed(colors, torch.zeros(3, 4)) == colors).all()
+    look = Look(0, RasterSettings(), exposures=torch.stack([torch.zeros(3, 4), exposure]))
+    torch.testing.assert_close(look.colors(colors, 1).reshape(-1, 3), torch.stack(wanted).clamp(0, 1))
+    assert (look.colors(colors, 0) == colors).all()

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,9 +9,8 @@ import pytest
 import torch
 
 from turbogs_plugin.device import peak_memory_bytes
-from turbogs_plugin.train import metrics
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
-from turbogs_plugin.train.metrics import Metrics, ViewMetrics, compare, load_lpips, psnr, ssim
+from turbogs_plugin.train.metrics import Metrics, ViewMetrics, compare, psnr, ssim
 from turbogs_plugin.train.progress import TrainingProgress
 
 FIELDS = {"iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians", "memory_bytes"}
@@ -107,28 +105,3 @@ def test_progress_is_a_bar_on_a_terminal(capsys, monkeypatch):
         progress.advanced(training(50, 1234))
     shown = capsys.readouterr().err
     assert all(part in shown for part in ("50/100", "PSNR 20.10 dB", "1,234 Gaussians", "it/s"))
-
-
-def test_lpips_takes_the_weights_of_torchs_cache_and_says_what_is_missing(tmp_path, monkeypatch):
-    class Network(torch.nn.Module):
-        def __init__(self, **_) -> None:
-            super().__init__()
-
-        def forward(self, image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
-            assert image.shape == photo.shape == (1, 3, 4, 5)
-            return (image - photo).abs().mean()
-
-    module = SimpleNamespace(LearnedPerceptualImagePatchSimilarity=Network)
-    monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", module)
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    monkeypatch.setattr(metrics, "LPIPS_PACKAGES", ("torch", "no_such_package"))
-    assert load_lpips(torch.device("cpu"))[1].startswith(
-        "it needs no_such_package: pip install no_such_package torch=="
-    )
-    monkeypatch.setattr(metrics, "LPIPS_PACKAGES", ())
-    function, reason = load_lpips(torch.device("cpu"))
-    assert function is None and f"put torchvision's file at {tmp_path}" in reason
-    (tmp_path / "checkpoints").mkdir()
-    (tmp_path / "checkpoints/vgg16-397923af.pth").touch()
-    function, reason = load_lpips(torch.device("cpu"))
-    assert function(torch.ones(4, 5, 3), torch.zeros(4, 5, 3)) == 1.0 and reason == ""

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from turbogs_plugin.config.sections import STRIPS
 from turbogs_plugin.files import read_text, write_text_atomically
+from turbogs_plugin.report.evaluation import load_lpips
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip
 from turbogs_plugin.report.provenance import hardware, software
 from turbogs_plugin.report.tables import ERRORS, error_columns, errors, history_rows, table, views_table
-from turbogs_plugin.train.metrics import Metrics, evaluate, load_lpips, render_view
+from turbogs_plugin.train.metrics import Metrics, evaluate, render_view
 from turbogs_plugin.train.session import RunSession
 
 
@@ -24,7 +25,7 @@ def write_report(run: RunSession) -> Path:
     trainer = run.trainer
     look = trainer.look(run.test.names)
     lpips, lpips_reason = load_lpips(trainer.device)
-    metrics = None if lpips else run.evaluations.metrics_at(trainer.iteration)
+    metrics = None if lpips else run.evaluations.metrics  # of the end
     if metrics is None:
         metrics = evaluate(trainer.gaussians, run.test, look, lpips, refined=True)
     run.clock.mark("report")

@@ -12,13 +12,14 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.device import free_device_memory
 from turbogs_plugin.plan import make_plan
+from turbogs_plugin.report.evaluation import load_lpips
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.study.results import CellResult, changes, curve_and_final, flat_settings, measured
 from turbogs_plugin.train.clock import WallClock
 from turbogs_plugin.train.loop import TrainingLoop
-from turbogs_plugin.train.metrics import Evaluations, evaluate, load_lpips
+from turbogs_plugin.train.metrics import Evaluations, evaluate
 from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.train.trainer import Trainer
 

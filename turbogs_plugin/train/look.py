@@ -81,12 +81,10 @@ class Look:
 
     def colors(self, colors: Tensor, view_id: int) -> Tensor:
         """[H, W, 3], 0 .. 1: the model's own colours [H, W, 3], seen by a view, with its exposure."""
-        return (colors if self.exposures is None else exposed(colors, self.exposures[view_id])).clamp(0.0, 1.0)
-
-
-def exposed(colors: Tensor, exposure: Tensor) -> Tensor:
-    """[..., 3]: ``c + A c + b`` of colours c [..., 3], by an exposure [3, 4]."""
-    return colors + (colors @ exposure[:, :3].T + exposure[:, 3])
+        if self.exposures is not None:
+            exposure = self.exposures[view_id]  # [3, 4], A | b: a colour c becomes c + A c + b
+            colors = colors + (colors @ exposure[:, :3].T + exposure[:, 3])
+        return colors.clamp(0.0, 1.0)
 
 
 def interpolated_exposures(offsets: Tensor, trained: Sequence[str], photos: Sequence[str]) -> Tensor:

@@ -7,12 +7,10 @@ view is shown with the exposure that is known of it, and errors of the model's o
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 
 import torch
 import torch.nn.functional as F
@@ -37,9 +35,6 @@ SSIM_SIGMA = 1.5
 
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 """Constants of Wang et al. 2004 for values 0 .. 1."""
-
-LPIPS_PACKAGES = ("torchvision", "torchmetrics")
-"""Packages with the network, and with LPIPS itself."""
 
 ImageError = Callable[[Tensor, Tensor], float]
 """LPIPS of an image against a photo, both [H, W, 3], 0 .. 1."""
@@ -198,29 +193,6 @@ def _blurred(images: Tensor) -> Tensor:
     return padded
 
 
-def load_lpips(device: torch.device) -> tuple[ImageError | None, str]:
-    """LPIPS (VGG16) by torchmetrics, if `LPIPS_PACKAGES` are installed and the backbone's weights are in torch's cache.
-    Nothing is downloaded, and what takes seconds to import is imported here.
-
-    Args:
-        device: where to compute.
-
-    Returns:
-        The function, or None; and the reason for None.
-    """
-    missing = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
-    if missing:
-        release = torch.__version__.partition("+")[0]  # or pip may bring another torch with torchvision
-        return None, f"it needs {' and '.join(missing)}: pip install {' '.join(missing)} torch=={release}"
-    weights = Path(torch.hub.get_dir()) / "checkpoints" / "vgg16-397923af.pth"  # torchvision's name
-    if not weights.is_file():
-        return None, f"there are no weights of VGG16 on this machine: put torchvision's file at {weights}"
-    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-
-    network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to(device)
-    return lambda image, photo: network(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]).item(), ""
-
-
 @dataclass
 class Evaluations(Listener):
     """Evaluates the model and passes the result to all listeners.
@@ -230,16 +202,12 @@ class Evaluations(Listener):
 
     Attributes:
         history: every evaluation.
-        metrics: errors of the newest one.
+        metrics: errors of the newest one; None where this process made none.
     """
 
     test: PosedImages
     history: list[Evaluation] = field(default_factory=list, init=False)
     metrics: Metrics | None = field(default=None, init=False)
-
-    def metrics_at(self, iteration: int) -> Metrics | None:
-        """Errors of this process's newest evaluation, if it was made at this iteration; None otherwise."""
-        return self.metrics if self.history and self.history[-1].iteration == iteration else None
 
     def begun(self, loop: TrainingLoop) -> None:
         if not self.history:
