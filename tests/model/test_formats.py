@@ -2,7 +2,6 @@
 
 import gzip
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -105,10 +104,3 @@ def test_a_damaged_spz_is_refused(tmp_path, damage):
     file.write_bytes({"cut": content[:-5], "longer": content[:40] + b"abc" + content[40:], "other": b"ply\nno"}[damage])
     with pytest.raises(InputError, match=file.name):
         FORMATS["spz"].read(file)
-
-
-def test_a_single_gaussian_and_one_place(tmp_path):
-    for name, form in FORMATS.items():
-        file = Path(tmp_path / name)
-        form.write(gaussians(1), file, Frame(np.zeros(3), 1.0), 0)
-        assert bool(torch.isfinite(form.read(file).means).all())

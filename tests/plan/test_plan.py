@@ -175,28 +175,19 @@ def test_the_verb_prints_the_plan_of_a_capture(turbogs, capture):
     assert lines.keys() == set(RULES) and lines["train.iterations"] == ["2000", "auto"]
 
 
-def test_a_planned_run_tells_its_plan_and_resumes_bit_for_bit(turbogs, capture, tmp_path, monkeypatch):
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+def test_a_planned_run_tells_its_plan_and_does_not_plan_again(turbogs, capture, tmp_path, monkeypatch):
+    stopped = tmp_path / "stopped"
     decided = [option for option in ALL_AUTO if option != "train.iterations=auto"]  # 2000 would take minutes
-    code, _, err = turbogs("train", capture, *TINY, *decided, "--out", whole, "--device", "cpu")
-    assert code == 0 and re.search(r"train.exposure +false +auto", err)
-    page = (whole / "report.md").read_text()
-    assert "## Plan" in page and "of 7 photos could be compared" in page
-    config = run.RunFolder(whole).read_config()
-    assert (config.train.backdrop, config.train.exposure, config.train.batch_for) == (False, False, 1)
-    assert re.search(r"train.exposure +false +auto", (whole / "plan.txt").read_text())
-
     stop_after(monkeypatch, 7)
-    assert turbogs("train", capture, *TINY, *decided, "--out", stopped, "--device", "cpu")[0] == 130
+    code, _, err = turbogs("train", capture, *TINY, *decided, "--out", stopped, "--device", "cpu")
+    assert code == 130 and re.search(r"train.exposure +false +auto", err)
     monkeypatch.undo()
+    config = run.RunFolder(stopped).read_config()
+    assert (config.train.backdrop, config.train.exposure, config.train.batch_for) == (False, False, 1)
+    assert re.search(r"train.exposure +false +auto", (stopped / "plan.txt").read_text())
     monkeypatch.setattr(run, "make_plan", None)  # a resumed run must not plan again
     run.resume(stopped, write_report)
-    states = [torch.load(folder / "checkpoints" / "iteration-000014.pt")["trainer"] for folder in (whole, stopped)]
-    for name, tensor in states[0]["gaussians"].items():
-        assert torch.equal(tensor, states[1]["gaussians"][name]), name
-    assert torch.equal(states[0]["maps"]["errors"], states[1]["maps"]["errors"])
-    assert (stopped / "config.yaml").read_text() == (whole / "config.yaml").read_text()
-    assert "## Plan" in (stopped / "report.md").read_text()
+    assert "of 7 photos could be compared" in (stopped / "report.md").read_text()
 
 
 def test_the_ablation_of_leave_outs_plans_each_cell(turbogs, capture, tmp_path):
