@@ -11,7 +11,7 @@ import torch
 from turbogs_plugin.device import peak_memory_bytes
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
 from turbogs_plugin.train.metrics import Metrics, ViewMetrics, compare, psnr, ssim
-from turbogs_plugin.train.progress import TrainingProgress
+from turbogs_plugin.train.session import TrainingProgress
 
 FIELDS = {"iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians", "memory_bytes"}
 
@@ -99,7 +99,7 @@ def test_progress_is_a_line_an_evaluation_where_there_is_no_terminal(capsys):
 def test_progress_is_a_bar_on_a_terminal(capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setattr("turbogs_plugin.train.progress.REFRESH_SECONDS", 0.0)
+    monkeypatch.setattr("turbogs_plugin.train.session.REFRESH_SECONDS", 0.0)
     with TrainingProgress() as progress:
         progress.evaluated(training(10, 5), evaluation(10))
         progress.advanced(training(50, 1234))

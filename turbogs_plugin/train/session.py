@@ -1,13 +1,15 @@
-"""The training of a run in one process, and what it writes into the run's folder."""
+"""The training of a run in one process: what it writes into the run's folder, and its progress on stderr."""
 
 from __future__ import annotations
 
 import signal
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -21,13 +23,17 @@ from turbogs_plugin.train.clock import WallClock, WallRecord
 from turbogs_plugin.train.history import Evaluation, append_evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.metrics import Evaluations
-from turbogs_plugin.train.progress import TrainingProgress
 from turbogs_plugin.train.run_files import RunFolder
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 Report = Callable[["RunSession"], object]
 """Writes the report of a finished run."""
 Watch = Sequence[Callable[["RunSession"], Listener]]
 """Functions that are called with a run before it trains, and give one more listener of its first process each."""
+REFRESH_SECONDS = 0.1
+"""Time between two updates of the bar, so that fast iterations are not slowed down."""
 
 
 @contextmanager
@@ -176,3 +182,53 @@ class RunSession(Listener):
     def _last_good(self) -> str:
         checkpoint = latest_checkpoint(self.folder.checkpoints)
         return f"the last good checkpoint is '{checkpoint}'" if checkpoint else "no checkpoint was saved before"
+
+
+class TrainingProgress(Listener):
+    """Shows iteration, time left, iterations a second, test PSNR and number of Gaussians.
+
+    rich is imported for a terminal alone. A context: the bar is shown while it is entered.
+    """
+
+    def __init__(self) -> None:
+        self._next_refresh = 0.0
+        self._psnr = self._warning = ""
+        self._bar: Progress | None = None
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+            said = TextColumn("{task.description}")
+            columns = (MofNCompleteColumn(), BarColumn(None), TimeRemainingColumn(), said)
+            self._bar = Progress(*columns, console=Console(stderr=True), auto_refresh=False, expand=True)
+            self._task = self._bar.add_task("", total=None)
+
+    def __enter__(self) -> TrainingProgress:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def advanced(self, loop: TrainingLoop) -> None:
+        if self._bar is None or time.perf_counter() < self._next_refresh:
+            return
+        self._next_refresh = time.perf_counter() + REFRESH_SECONDS
+        trainer, speed = loop.trainer, self._bar.tasks[0].speed or 0.0
+        said = f"{speed:,.0f} it/s  {self._psnr}{len(trainer.gaussians):,} Gaussians  {self._warning}"
+        self._bar.update(self._task, completed=trainer.iteration, total=trainer.iterations, description=said)
+        self._bar.refresh()
+
+    def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
+        counts = {"non-finite losses": evaluation.nonfinite_losses, "skipped updates": evaluation.skipped_updates}
+        self._psnr = f"PSNR {evaluation.psnr:.2f} dB  "
+        self._warning = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+        if self._bar is None:
+            total = loop.trainer.iterations
+            line = (
+                f"iteration {evaluation.iteration:>{len(str(total))}}/{total}  {evaluation.train_seconds:7.1f} s  "
+                f"test {self._psnr}SSIM {evaluation.ssim:.4f}  {evaluation.num_gaussians} Gaussians  {self._warning}"
+            )
+            print(line.rstrip(), file=sys.stderr, flush=True)
