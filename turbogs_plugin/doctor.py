@@ -10,8 +10,8 @@ import torch
 from packaging.requirements import Requirement
 
 from turbogs_plugin.engine import library
+from turbogs_plugin.report.evaluation import LPIPS_PACKAGES
 from turbogs_plugin.report.provenance import hardware, missing_bytecode, software
-from turbogs_plugin.train.perceptual import LPIPS_PACKAGES, load_flip
 from turbogs_plugin.viewer.server import INSTALL as INSTALL_VIEWER
 
 REQUIREMENTS = (
@@ -51,8 +51,6 @@ def diagnosis() -> str:
         missing.append(reason)
     absent = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
     missing += [f"{name}: LPIPS is not computed" for name in absent]
-    if reason := load_flip()[1]:
-        missing.append(f"FLIP is not computed: {reason}")
     if importlib.util.find_spec("viser") is None:
         missing.append(f"viser: no live viewer; {INSTALL_VIEWER}")
     if lacking := lacking_packages():

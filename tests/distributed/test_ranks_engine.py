@@ -45,7 +45,7 @@ CASES = {
     "dropout": ("train.dropout=0.3",),
     "masked": ("schedule.min_views=7", "schedule.max_views=7"),
     "masked tiles": ("pixel_sampler.unit=tile", "schedule.type=fixed", "schedule.views=2"),
-    "hosted": ("train.maps_place=host", "train.photos_place=host"),
+    "hosted": ("train.pixels_place=host",),
     "all records": (),
 }
 """Name -> overrides. A masked case is of the capture with masks. In all but the last one rows have owners."""

@@ -29,7 +29,7 @@ def refused(result: tuple[int, str, str], *words: object) -> None:
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_an_export_says_bytes_and_what_was_lost(turbogs, finished, tmp_path, name):
-    file = tmp_path / f"m{FORMATS[name].suffix}"
+    file = tmp_path / f"m.{name}"
     code, out, err = turbogs("export", finished, "--format", name, "--out", file)
     assert code == 0, err
     held = sum(4 * value.numel() for _, value in load_ply(finished / "model.ply").items())
@@ -70,8 +70,8 @@ def test_a_run_whose_capture_is_gone_is_exported_unmeasured(turbogs, finished, c
     shutil.copytree(finished, moved)
     text = (moved / "config.yaml").read_text()
     (moved / "config.yaml").write_text(text.replace(str(capture), str(tmp_path / "gone")))
-    code, out, _ = turbogs("export", moved, "--format", "splat")
-    assert code == 0 and "not measured" in out and (moved / "model.splat").is_file()
+    code, out, _ = turbogs("export", moved, "--format", "spz")
+    assert code == 0 and "not measured" in out and (moved / "model.spz").is_file()
     refused(turbogs("export", moved, "--format", "html"), "gone")
     refused(turbogs("export", moved, "--max-gaussians", "5", "--out", tmp_path / "a.ply"), "gone")
 
@@ -104,7 +104,7 @@ def test_bad_input_is_one_line(turbogs, finished, capture, tmp_path):
     points = tmp_path / "points.ply"
     places = "".join(f"property float {axis}\n" for axis in "xyz")
     points.write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{places}end_header\n1 2 3\n")
-    refused(turbogs("export", finished, "--format", "obj"), "--format obj", "compressed-ply")
+    refused(turbogs("export", finished, "--format", "obj"), "--format obj", "ply, pt, spz")
     refused(turbogs("export", tmp_path, "--format", "spz"), "holds no run")
     refused(turbogs("export", finished, "--format", "html", "--out", tmp_path / "x.md"), "ends in .html")
     call = ("export", points, "--scene", capture, "--format", "spz", "--out")

@@ -22,8 +22,8 @@ def scene(tmp_path_factory):
 
 @pytest.mark.parametrize("places", ["device", "host"])
 def test_training_with_exposures_waits_for_nothing(scene, places):
-    overrides = ("train.exposure=true", "density.refine_from=1000", f"train.photos_place={places}")
-    config = tiny_config("capture", "train.device=cuda", f"train.maps_place={places}", *overrides)
+    overrides = ("train.exposure=true", "density.refine_from=1000", f"train.pixels_place={places}")
+    config = tiny_config("capture", "train.device=cuda", *overrides)
     trainer = Trainer(config.without_plan(), scene, DEVICE)
     assert_iterations_wait_for_nothing(trainer)
     assert trainer.exposures.offsets.any() and trainer.exposures.offsets.mean(dim=0).abs().max() < 1e-6

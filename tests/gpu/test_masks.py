@@ -178,7 +178,7 @@ def test_training_with_masks_waits_for_nothing_and_learns_no_masked_pixel(masked
 
 
 def test_maps_and_photos_on_the_host_have_the_same_masks(masked_capture):
-    config = tiny_config("capture", "train.device=cuda", "train.maps_place=host", "train.photos_place=host")
+    config = tiny_config("capture", "train.device=cuda", "train.pixels_place=host")
     trainer = Trainer(config.without_plan(), masked_capture, DEVICE)
     loop = TrainingLoop(trainer)
     loop.run()

@@ -40,8 +40,8 @@ STILL = ("optimizer.type=sparse_adam", "optimizer.learning_rates.batch_scale=0",
 models that learn differ in their last bits.)"""
 
 
-def trained(scene: Scene, maps: str, photos: str, iterations: int, *overrides: str) -> Trainer:
-    config = config_of(f"train.maps_place={maps}", f"train.photos_place={photos}", *overrides).without_plan()
+def trained(scene: Scene, place: str, iterations: int, *overrides: str) -> Trainer:
+    config = config_of(f"train.pixels_place={place}", *overrides).without_plan()
     trainer = Trainer(config, scene, GPU)
     trainer.initialise_maps()
     run(trainer, iterations)
@@ -60,10 +60,9 @@ def assert_same_maps(a: Trainer, b: Trainer) -> None:
 
 
 @pytest.mark.parametrize("unit", ["pixel", "tile"])
-@pytest.mark.parametrize(("maps", "photos"), [("host", "host"), ("host", "device"), ("device", "host")])
-def test_maps_and_samples_are_those_of_resident_ones(scene, maps, photos, unit):
-    places = (("device", "device"), (maps, photos))
-    resident, offloaded = (trained(scene, *place, 30, f"pixel_sampler.unit={unit}", *STILL) for place in places)
+def test_maps_and_samples_are_those_of_resident_ones(scene, unit):
+    unit_of = f"pixel_sampler.unit={unit}"
+    resident, offloaded = (trained(scene, place, 30, unit_of, *STILL) for place in ("device", "host"))
     assert torch.equal(resident.gaussians.means, offloaded.gaussians.means)
     assert_same_maps(resident, offloaded)
     step = resident.now
@@ -73,12 +72,11 @@ def test_maps_and_samples_are_those_of_resident_ones(scene, maps, photos, unit):
         trainer.views.photos.at(drawn).colors() for trainer, drawn in zip((resident, offloaded), samples, strict=True)
     ]
     assert torch.equal(*truths)
-    if maps == photos == "host":
-        assert (offloaded.maps.offsets == offloaded.views.photos.offsets).all()
+    assert (offloaded.maps.offsets == offloaded.views.photos.offsets).all()
 
 
 def test_maps_follow_through_checkpoints_and_the_turn_of_the_stamps(scene):
-    resident, offloaded = (trained(scene, place, place, 8, *STILL) for place in ("device", "host"))
+    resident, offloaded = (trained(scene, place, 8, *STILL) for place in ("device", "host"))
     resumed = Trainer(offloaded.config, scene, GPU)
     resumed.load_state_dict(copy.deepcopy(offloaded.state_dict()))
     for trainer in (resident, offloaded, resumed):
@@ -90,7 +88,7 @@ def test_maps_follow_through_checkpoints_and_the_turn_of_the_stamps(scene):
 
 
 def test_iterations_that_do_nothing_leave_the_maps_alone(scene, monkeypatch):
-    trainer = trained(scene, "host", "host", 10, *EVENTS)
+    trainer = trained(scene, "host", 10, *EVENTS)
     before = copy.deepcopy(trainer.maps.state_dict())
     trainer.engine.workspace.status[1] = 1  # as after an overflow
     monkeypatch.setattr(
@@ -115,9 +113,9 @@ def test_a_capture_larger_than_the_limit_trains_within_it():
         plan = make_plan(asked, scene, GPU)
         config = within_memory(plan.apply(asked), scene)
         hold_to_limit(config, GPU)
-        assert (config.train.maps_place, config.train.photos_place) == ("host", "host")
+        assert config.train.pixels_place == "host"
         with pytest.raises(torch.cuda.OutOfMemoryError):
-            Trainer(config_of("train.maps_place=device", "train.photos_place=device").without_plan(), scene, GPU)
+            Trainer(config_of("train.pixels_place=device").without_plan(), scene, GPU)
         gc.collect()
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()

@@ -36,8 +36,8 @@ class Watcher:
 def subjects(request, tmp_path_factory) -> tuple[ModelState, ModelState]:
     """A model at the end of its densification on a GPU, and the same with everything on the CPU."""
     capture = tiny_capture(tmp_path_factory.mktemp("viewer"))
-    places = (f"train.maps_place={request.param}", f"train.photos_place={request.param}")
-    config = tiny_config(capture, "train.device=cuda", "train.iterations=8", "train.refine_until=8", *places)
+    place = f"train.pixels_place={request.param}"
+    config = tiny_config(capture, "train.device=cuda", "train.iterations=8", "train.refine_until=8", place)
     scene = load_scene(capture)
     loop = new_loop(make_plan(config, scene, CUDA).apply(config), scene, CUDA)
     trainer = loop.trainer

@@ -1,9 +1,7 @@
 """Every format is read back."""
 
 import gzip
-import re
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ import torch
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
-from turbogs_plugin.model.similarity import Similarity, in_capture
+from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.model.spz import packed
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.types import SH_C0, Gaussians
@@ -47,8 +45,6 @@ def rotations(quats: torch.Tensor) -> torch.Tensor:
 STEPS = {
     "ply": (1e-6, 1e-6, 1e-5, 1e-6, 1e-6, 1e-6),
     "pt": (1e-6, 1e-6, 1e-5, 1e-6, 1e-6, 1e-6),
-    "compressed-ply": (1e-3, 3e-3, 0.02, 0.003, 0.02, 0.02),
-    "splat": (1e-6, 0.02, 1e-4, 0.005, 0.005, None),
     "spz": (1e-5, 3e-3, 0.032, 0.003, 0.008, 0.004),
 }
 
@@ -56,7 +52,7 @@ STEPS = {
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_format_reads_back_within_its_steps(tmp_path, name):
     made, frame = gaussians(), Frame(np.array([3.0, -2.0, 5.0]), 2.5)
-    file = tmp_path / f"m{FORMATS[name].suffix}"
+    file = tmp_path / f"m.{name}"
     FORMATS[name].write(made, file, frame, 7)
     read = matched(made, Similarity.into(frame).apply(FORMATS[name].read(file)).map(torch.Tensor.float))
     mean, rotation, scale, opacity, color, harmonic = STEPS[name]
@@ -67,12 +63,8 @@ def test_a_format_reads_back_within_its_steps(tmp_path, name):
     assert float((1 - turned**2).sqrt().max()) <= 2 * rotation + 1e-6
     assert float((read.scales - made.scales).abs().max()) <= scale
     assert float((torch.sigmoid(read.opacities) - torch.sigmoid(made.opacities)).abs().max()) <= opacity
-    shown = (SH_C0 * made.sh0 + 0.5).clamp(0, 1) if name == "splat" else SH_C0 * made.sh0 + 0.5
-    assert float((SH_C0 * read.sh0 + 0.5 - shown).abs().max()) <= color
-    if harmonic is not None:
-        assert float((read.shN - made.shN).abs().max()) <= harmonic
-    else:
-        assert read.shN.shape[1] == 0
+    assert SH_C0 * float((read.sh0 - made.sh0).abs().max()) <= color
+    assert float((read.shN - made.shN).abs().max()) <= harmonic
 
 
 def test_spz_by_hand():
@@ -97,59 +89,18 @@ def test_spz_by_hand():
     assert list(body[20:]) == [128] * 9
 
 
-@pytest.mark.parametrize("name", ["pt", "compressed-ply", "splat", "spz"])
+@pytest.mark.parametrize("name", ["pt", "spz"])
 def test_a_capture_far_from_its_origin_is_refused_in_single_precision(tmp_path, name):
     with pytest.raises(InputError, match="--format ply"):
         FORMATS[name].write(gaussians(), tmp_path / "m", Frame(np.array([5e8, 0.0, 0.0]), 1.0), 0)
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["compressed-ply", "splat", "spz"])
 @pytest.mark.parametrize("damage", ["cut", "longer", "other"])
-def test_a_damaged_file_is_refused(tmp_path, name, damage):
+def test_a_damaged_spz_is_refused(tmp_path, damage):
     file = tmp_path / "m"
-    FORMATS[name].write(gaussians(), file, Frame(np.zeros(3), 1.0), 0)
+    FORMATS["spz"].write(gaussians(), file, Frame(np.zeros(3), 1.0), 0)
     content = file.read_bytes()
     file.write_bytes({"cut": content[:-5], "longer": content[:40] + b"abc" + content[40:], "other": b"ply\nno"}[damage])
     with pytest.raises(InputError, match=file.name):
-        FORMATS[name].read(file)
-
-
-def test_a_compressed_ply_of_degree_0_by_supersplat_is_read(tmp_path):
-    """It has no element sh."""
-    file, written = tmp_path / "m.compressed.ply", FORMATS["compressed-ply"]
-    written.write(gaussians(degree=0), file, Frame(np.zeros(3), 1.0), 0)
-    expected = written.read(file)
-    file.write_bytes(re.sub(rb"element sh \d+\n", b"", file.read_bytes()))
-    for name in ("compressed-ply", "ply"):
-        read = dict(FORMATS[name].read(file).items())
-        for parameter, value in expected.items():
-            assert torch.equal(read[parameter], value)
-
-
-def test_a_model_of_faint_gaussians_is_refused_as_a_compressed_ply(tmp_path):
-    """gsplat leaves them all out, and then fails at the first chunk."""
-    made = gaussians(4)
-    made.opacities[:] = -6.0
-    with pytest.raises(InputError, match=r"no Gaussian has an opacity above 1/255, .*: export with --format ply"):
-        FORMATS["compressed-ply"].write(made, tmp_path / "m.ply", Frame(np.zeros(3), 1.0), 0)
-    made.opacities[2] = -5.0
-    FORMATS["compressed-ply"].write(made, tmp_path / "m.ply", Frame(np.zeros(3), 1.0), 0)
-    assert len(FORMATS["compressed-ply"].read(tmp_path / "m.ply")) == 1
-
-
-def test_gaussians_that_are_not_finite_are_left_out():
-    made = gaussians(10)
-    made.scales[3, 1] = torch.inf
-    with pytest.warns(UserWarning, match="1 of 10 Gaussians are not finite"):
-        assert len(in_capture(made, Frame(np.zeros(3), 1.0), Path("x"))) == 9
-    made.means[:] = torch.nan
-    with pytest.warns(UserWarning), pytest.raises(InputError, match="no Gaussians"):
-        in_capture(made, Frame(np.zeros(3), 1.0), Path("x"))
-
-
-def test_a_single_gaussian_and_one_place(tmp_path):
-    for name, form in FORMATS.items():
-        file = Path(tmp_path / name)
-        form.write(gaussians(1), file, Frame(np.zeros(3), 1.0), 0)
-        assert bool(torch.isfinite(form.read(file).means).all())
+        FORMATS["spz"].read(file)

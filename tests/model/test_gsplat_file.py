@@ -61,7 +61,7 @@ def test_splats_that_are_no_model(changes, words):
 
 
 def test_no_splats_at_all():
-    with pytest.raises(InputError, match="holds no Gaussians"):
+    with pytest.raises(InputError, match="holds 0 Gaussians"):
         read_gsplat({"splats": dict(random_gaussians(0).items())}, "model.pt")
     with pytest.raises(InputError, match="lack means"):
         read_gsplat({"splats": [1]}, "model.pt")

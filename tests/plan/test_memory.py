@@ -6,11 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config, resolve
 from turbogs_plugin.config.sections import parse_bytes
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, cap_of, chosen_points, growth_room, with_cap, without_growth
-from turbogs_plugin.plan.memory import MemoryDemand, most_images
+from turbogs_plugin.plan.memory import (
+    FEWEST_GAUSSIANS,
+    MemoryDemand,
+    cap_of,
+    most_images,
+    with_cap,
+    within_memory,
+)
 
 
 @pytest.mark.parametrize("kind", ["error_driven", "mcmc", "none"])
@@ -20,31 +27,19 @@ def test_a_cap_is_a_setting_of_the_density_control(kind):
     assert capped.density["max_gaussians"] == cap_of(capped) == capped.build("density").max_gaussians == 5000
     assert resolve(capped.to_mapping()) == capped
     assert with_cap(capped, 7000).density["max_gaussians"] == 7000, "what is asked for last is set"
-    still = without_growth(capped)
-    assert (still.density, cap_of(still)) == ({"type": "none", "max_gaussians": 5000}, 5000)
 
 
 def test_no_cap_is_0():
-    free = load_config("turbogs")
-    assert cap_of(free) == cap_of(without_growth(free)) == 0
+    assert cap_of(load_config("turbogs")) == 0
 
 
-@pytest.mark.parametrize(
-    ("settings", "times"),
-    [
-        (["density.final_every=500"], 0.95**-2),
-        (["density.final_every=200"], 0.95**-3),
-        (["density.final_every=2000"], 1.0),
-        (["density.final_keep=1"], 1.0),
-        (["density.final_keep=0.1"], 2.0),
-        (["density.final_keep=1e-300"], 2.0),
-        (["density.type=mcmc"], 1.0),
-        (["density.type=none"], 1.0),
-    ],
-)
-def test_a_memory_budget_leaves_room_for_what_is_grown_beyond_the_cap(settings, times):
-    config = load_config("turbogs", ["train.iterations=5000", "train.refine_until=3500", *settings])
-    assert growth_room(config) == pytest.approx(times)
+@pytest.mark.parametrize(("settings", "times"), [((), 0.95**-2), (("density.type=mcmc",), 1.0)])
+def test_a_memory_budget_leaves_room_for_what_is_grown_beyond_the_cap(capture, settings, times):
+    lengths = ("train.iterations=5000", "train.refine_until=3500", "budget.max_memory=100MiB")
+    config, scene = load_config("turbogs", [*lengths, *settings]), load_scene(capture)
+    most = MemoryDemand.of(config, scene.train.cameras.sizes, scene.test.cameras.sizes).gaussians(100 * 2**20)
+    assert cap_of(within_memory(config, scene)) == int(most / times)
+    assert cap_of(within_memory(with_cap(config, 9), scene)) == 9
 
 
 @pytest.mark.parametrize("kind", ["gsplat_default", "fastgs"])
@@ -59,27 +54,15 @@ def test_a_cap_that_nobody_would_keep_is_refused(turbogs, tmp_path, kind):
     assert code == 2 and words in err
 
 
-def test_a_model_begins_with_points_from_the_first_to_the_last_that_leave_room():
-    chosen = chosen_points(100, 30, 10)
-    assert len(chosen) == 20 and (chosen[0], chosen[-1]) == (0, 99)
-    assert set(np.diff(chosen)) == {5, 6}
-    assert chosen_points(20, 30, 10) == chosen_points(20, 0, 10) == slice(None)
-    with pytest.raises(InputError, match="leaves no room beside the 30"):
-        chosen_points(20, 30, 30)
-
-
 def demand(*overrides: str) -> MemoryDemand:
     config = load_config("turbogs", ["schedule.max_views=10", "train.sh_degree=3", *overrides])
     return MemoryDemand.of(config, np.full((200, 2), (3840, 2160)), np.full((25, 2), (3840, 2160)))
 
 
 def test_memory_is_what_is_kept_and_what_is_done_with_it():
-    resident, maps, both = (
-        demand(*(f"train.{name}_place=host" for name in names)) for names in ([], ["maps"], ["maps", "photos"])
-    )
-    assert resident.per_gaussian == both.per_gaussian == 2 * (59 * 4 * 3 + 4 + 32) + 230 * 10
-    assert resident.fixed - maps.fixed == 4 * (200 - 20) * 8_294_400
-    assert maps.fixed - both.fixed == 3 * (225 - 22) * 8_294_400
+    resident, windows = (demand(f"train.pixels_place={place}") for place in ("device", "host"))
+    assert resident.per_gaussian == windows.per_gaussian == 2 * (59 * 4 * 3 + 4 + 32) + 230 * 10
+    assert resident.fixed - windows.fixed == (4 * (200 - 20) + 3 * (225 - 22)) * 8_294_400
     assert demand("train.sh_degree=0").per_gaussian == resident.per_gaussian - 2 * 45 * 12
 
 
@@ -97,7 +80,7 @@ def test_no_measured_peak_is_above_the_prediction():
 
 @pytest.mark.parametrize("limit", [2**33, 2**34])
 def test_as_many_gaussians_as_fit(limit):
-    memory = demand("train.maps_place=host", "train.photos_place=host")
+    memory = demand("train.pixels_place=host")
     count = memory.gaussians(limit)
     assert memory.fixed + count * memory.per_gaussian <= limit < memory.fixed + (count + 1) * memory.per_gaussian
 

@@ -10,7 +10,7 @@ from turbogs_plugin.plan import gather_facts
 from turbogs_plugin.plan.photo_gains import _comparable, compare_exposures, fit_gains
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.photos import Photos
-from turbogs_plugin.train.initial_state import first_exposures
+from turbogs_plugin.train.training_state import first_exposures
 from turbogs_plugin.types import Cameras
 
 VIEWS = 14

@@ -3,7 +3,9 @@
 import math
 import re
 import subprocess
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import matplotlib
 import numpy as np
@@ -12,7 +14,7 @@ import torch
 from helpers.framework_runs import tiny_capture, tiny_config
 from PIL import Image
 
-from turbogs_plugin.report import provenance
+from turbogs_plugin.report import evaluation, provenance
 from turbogs_plugin.report.curves import plot_against_seconds
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, GAP, depth_picture, error_picture, save_image, strip
 from turbogs_plugin.report.run_report import write_report
@@ -111,3 +113,28 @@ def test_a_depth_picture_is_bright_where_near_and_black_where_nothing_is():
     assert brightness[3] > 0 == brightness[4]
     assert not depth_picture(np.zeros((2, 3), dtype=np.float32)).any()
     assert depth_picture(np.full((2, 3), 4.0, dtype=np.float32)).any()  # one depth everywhere
+
+
+def test_lpips_takes_the_weights_of_torchs_cache_and_says_what_is_missing(tmp_path, monkeypatch):
+    class Network(torch.nn.Module):
+        def __init__(self, **_) -> None:
+            super().__init__()
+
+        def forward(self, image: torch.Tensor, photo: torch.Tensor) -> torch.Tensor:
+            assert image.shape == photo.shape == (1, 3, 4, 5)
+            return (image - photo).abs().mean()
+
+    module = SimpleNamespace(LearnedPerceptualImagePatchSimilarity=Network)
+    monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", module)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr(evaluation, "LPIPS_PACKAGES", ("torch", "no_such_package"))
+    assert evaluation.load_lpips(torch.device("cpu"))[1].startswith(
+        "it needs no_such_package: pip install no_such_package torch=="
+    )
+    monkeypatch.setattr(evaluation, "LPIPS_PACKAGES", ())
+    function, reason = evaluation.load_lpips(torch.device("cpu"))
+    assert function is None and f"put torchvision's file at {tmp_path}" in reason
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints/vgg16-397923af.pth").touch()
+    function, reason = evaluation.load_lpips(torch.device("cpu"))
+    assert function(torch.ones(4, 5, 3), torch.zeros(4, 5, 3)) == 1.0 and reason == ""

@@ -30,23 +30,14 @@ def scene(capture) -> Scene:
     return load_scene(capture)
 
 
-def trainer_of(scene: Scene, capture: Path, maps: bool, photos: bool, *overrides: str) -> Trainer:
-    """A trainer with these two in host memory."""
-    places = [
-        f"train.{name}_place={'host' if host else 'device'}" for name, host in (("maps", maps), ("photos", photos))
-    ]
-    return Trainer(tiny_config(capture, *places, *overrides).without_plan(), scene, CPU)
+def trainer_of(scene: Scene, capture: Path, place: str, *overrides: str) -> Trainer:
+    return Trainer(tiny_config(capture, f"train.pixels_place={place}", *overrides).without_plan(), scene, CPU)
 
 
-@pytest.mark.parametrize(
-    ("maps", "photos", "unit"),
-    [(True, True, "pixel"), (True, True, "tile"), (True, False, "pixel"), (False, True, "pixel")],
-)
-def test_training_is_bit_for_bit_that_of_resident_maps_and_photos(scene, capture, maps, photos, unit):
+@pytest.mark.parametrize("unit", ["pixel", "tile"])
+def test_training_is_bit_for_bit_that_of_resident_maps_and_photos(scene, capture, unit):
     overrides = (f"pixel_sampler.unit={unit}", "schedule.max_views=2")
-    resident, offloaded = (
-        trainer_of(scene, capture, *places, *overrides) for places in ((False, False), (maps, photos))
-    )
+    resident, offloaded = (trainer_of(scene, capture, place, *overrides) for place in ("device", "host"))
     for trainer in (resident, offloaded):
         trainer.initialise_maps()
     assert_identical(resident.state_dict(), offloaded.state_dict())
@@ -54,19 +45,16 @@ def test_training_is_bit_for_bit_that_of_resident_maps_and_photos(scene, capture
         resident.step()
         offloaded.step()
     assert_identical(resident.state_dict(), offloaded.state_dict())
-    if maps:
-        assert len(offloaded.maps.errors) < len(resident.maps.errors)  # a window, not all of it
-    if photos:
-        assert len(offloaded.views.photos.colors) < len(resident.views.photos.colors)
-    if maps and photos:
-        places = offloaded.maps.offsets
-        assert np.array_equal(places, offloaded.views.photos.offsets)  # so that one kernel can use both,
-        assert len(offloaded.maps.errors) == len(offloaded.views.photos.colors)  # which it checks
-        assert (places != ABSENT).sum() == 4
+    assert len(offloaded.maps.errors) < len(resident.maps.errors)  # a window, not all of it
+    assert len(offloaded.views.photos.colors) < len(resident.views.photos.colors)
+    places = offloaded.maps.offsets
+    assert np.array_equal(places, offloaded.views.photos.offsets)  # so that one kernel can use both,
+    assert len(offloaded.maps.errors) == len(offloaded.views.photos.colors)  # which it checks
+    assert (places != ABSENT).sum() == 4
 
 
 def test_a_run_stops_with_resident_maps_and_goes_on_with_offloaded_ones(scene, capture):
-    whole, first, second = (trainer_of(scene, capture, host, host) for host in (False, False, True))
+    whole, first, second = (trainer_of(scene, capture, place) for place in ("device", "device", "host"))
     for trainer in (whole, first):
         trainer.initialise_maps()
     for _ in range(6):
@@ -84,7 +72,7 @@ def test_a_run_stops_with_resident_maps_and_goes_on_with_offloaded_ones(scene, c
 @pytest.mark.parametrize("place", ["device", "host"])
 def test_photos_stay_in_host_memory_when_a_run_is_looked_at(capture, tmp_path, monkeypatch, place):
     """Evaluated, where it was planned so, with the same errors; rendered, always."""
-    config = tiny_config(capture, f"train.photos_place={place}", "train.iterations=2")
+    config = tiny_config(capture, f"train.pixels_place={place}", "train.iterations=2")
     outcome = run.train(config, tmp_path / "run")
     to, moved = Photos.to, []
     monkeypatch.setattr(Photos, "to", lambda photos, device: moved.append(device) or to(photos, device))

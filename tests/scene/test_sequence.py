@@ -5,8 +5,8 @@ import torch
 from turbogs_plugin.scene.sequence import Neighbours, PhotoOrder
 
 
-def neighbours(known: list[str], photos: list[str], apart: int = 1) -> Neighbours:
-    return PhotoOrder([*known, *photos]).neighbours(known, photos, apart)
+def neighbours(known: list[str], photos: list[str]) -> Neighbours:
+    return PhotoOrder([*known, *photos]).neighbours(known, photos)
 
 
 def test_the_nearer_neighbour_weighs_more_and_all_photos_count():
@@ -14,7 +14,6 @@ def test_the_nearer_neighbour_weighs_more_and_all_photos_count():
     assert near.rows.tolist() == [[1, 2], [0, 1], [0, 1]]  # 9 is before 10, and 4 and 5 between 3 and 8
     torch.testing.assert_close(near.weights, torch.tensor([[1 / 2, 1 / 2], [2 / 3, 1 / 3], [1 / 3, 2 / 3]]))
     torch.testing.assert_close(near.mean(torch.tensor([0.0, 3.0, 5.0])), torch.tensor([4.0, 1.0, 2.0]))
-    assert near.distances.tolist() == [1, 1, 1]
 
 
 def test_a_photo_is_no_neighbour_of_itself():
@@ -29,11 +28,3 @@ def test_each_folder_is_a_sequence_of_its_own():
     assert near.rows.tolist() == [[0, 1], [0, 2], [0, 0]]
     assert near.weights.tolist() == [[0.5, 0.5], [0.0, 1.0], [0.0, 0.0]]
     assert near.mean(torch.ones(3, 2)).tolist() == [[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]
-
-
-def test_neighbours_some_photos_apart():
-    names = [f"{number}.png" for number in range(9)]
-    near = neighbours(names, names, 3)
-    assert near.rows.tolist()[2:5] == [[0, 5], [0, 6], [1, 7]] and near.distances.tolist() == [3] * 9
-    few = neighbours(names[::4], names, 2)
-    assert few.rows.tolist()[3:6] == [[0, 2], [0, 2], [0, 2]] and few.distances.tolist()[3:6] == [3, 4, 3]

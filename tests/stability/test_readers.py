@@ -23,7 +23,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.gsplat_file import save_gsplat
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.scene import Frame, Scene
-from turbogs_plugin.train.initial_state import initial_gaussians
+from turbogs_plugin.train.training_state import initial_gaussians
 from turbogs_plugin.types import Gaussians
 
 MEMORY = 64 * 2**20

@@ -122,7 +122,7 @@ def test_events_that_come_sooner_take_less_of_the_opacities():
         ("title: x\nvariants: {a/b: []}", "a/b"),
         ("title: x\nvariants: {full: []}\nbaseline: ful", "did you mean 'full'"),
         ("variants: {a: []}", "title"),
-        ("title: x\nvariants: {a: []}\nnotes: {true: b}", "name True is not text"),
+        ("title: x\nvariants: {a: []}\nnotes: {true: b}", "expected text, got True"),
         ("title: x\nvariants: {a: train.seed=1}", "list"),
     ],
 )

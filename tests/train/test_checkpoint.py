@@ -3,7 +3,6 @@
 import errno
 import os
 import pickle
-import subprocess
 import threading
 import zipfile
 
@@ -12,8 +11,7 @@ import torch
 
 from turbogs_plugin import files
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.model import ply, torch_file
-from turbogs_plugin.model.initial import gaussians_from_points
+from turbogs_plugin.model import torch_file
 from turbogs_plugin.train import checkpoint
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history
@@ -121,40 +119,6 @@ def test_a_kill_between_any_two_steps_keeps_a_whole_checkpoint(tmp_path, monkeyp
     assert_newest(tmp_path, int(newest.stem[-1]))
     save_checkpoint(tmp_path, 4, state(4.0))
     assert_newest(tmp_path, 4.0)
-
-
-@pytest.mark.parametrize(("number", "room"), [(1, 0), (1, 2000)])
-def test_a_kill_in_the_middle_of_a_write_keeps_a_whole_checkpoint(tmp_path, monkeypatch, number, room):
-    save_checkpoint(tmp_path, 1, state(1.0))
-    opened = []
-
-    class Torn(DiskFull):
-        def write(self, data) -> int:
-            if len(data) > self.room:
-                self.file.write(data[: self.room])
-                raise Killed
-            self.room -= len(data)
-            return self.file.write(data)
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_) -> None:
-            self.file.close()
-
-    def torn_open(path, mode):
-        opened.append(path)
-        return Torn(open(path, mode), room if len(opened) == number else 10**9)
-
-    def killed(*_, **__):
-        raise Killed
-
-    monkeypatch.setattr(files, "open", torn_open, raising=False)
-    monkeypatch.setattr(files.Path, "unlink", killed)
-    with pytest.raises((Killed, TrainingStopped)):
-        save_checkpoint(tmp_path, 2, state(2.0))
-    monkeypatch.undo()
-    assert_newest(tmp_path, 1.0)
 
 
 def test_a_torn_temporary_file_is_no_checkpoint(tmp_path):
@@ -280,25 +244,3 @@ def test_a_last_line_that_was_cut_is_left_out_of_a_history(tmp_path, cut):
     path.write_text(f"{cut.rstrip()}\n{whole}")
     with pytest.raises(InputError, match=r"history\.jsonl' line 1 is not an evaluation: take that line out"):
         read_history(path)
-
-
-def test_a_model_is_written_as_atomically_as_a_checkpoint(tmp_path, monkeypatch):
-    """A full disk leaves the old one, and what a killed process left behind does not stay."""
-    target = tmp_path / "model.ply"
-    model = gaussians_from_points(torch.rand(5, 3), torch.zeros(5, 3, dtype=torch.uint8), 0, 1.0)
-    target.write_text("old")
-    gone = subprocess.run(["sh", "-c", "echo $$"], capture_output=True, text=True).stdout.strip()
-    own = files.partial_path(target)
-    own.with_name(own.name.replace(f".{os.getpid()}.", f".{gone}.")).write_text("torn")
-    whole_write = files.write_atomically
-
-    def limited(path, write, **options):
-        whole_write(path, lambda file: write(DiskFull(file, 10)), **options)
-
-    with monkeypatch.context() as context:
-        context.setattr(ply, "write_atomically", limited)
-        with pytest.raises(InputError, match=r"cannot write .*model\.ply: No space left"):
-            ply.save_ply(model, target)
-    assert target.read_text() == "old" and os.listdir(tmp_path) == ["model.ply"]
-    ply.save_ply(model, target)
-    assert len(ply.load_ply(target)) == 5 and os.listdir(tmp_path) == ["model.ply"]

@@ -1,7 +1,5 @@
-"""Training with an exposure for each photo, and errors after a colour alignment."""
+"""Training with an exposure for each photo."""
 
-import math
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,12 +10,14 @@ from PIL import Image
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.render import render_image
+from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.export.renders import render_run
 from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from turbogs_plugin.train.history import read_history
-from turbogs_plugin.train.metrics import align_colors, evaluate, render_view
+from turbogs_plugin.train.look import Look, interpolated_exposures
+from turbogs_plugin.train.metrics import evaluate, render_view
 from turbogs_plugin.train.run import train
 from turbogs_plugin.train.trainer import Trainer
 
@@ -51,12 +51,12 @@ def trainer_of(scene, *overrides: str) -> Trainer:
 
 def test_the_dark_photo_gets_a_dark_exposure_and_the_mean_stays_the_identity(scene):
     trainer = trainer_of(scene, *ON, "train.iterations=60")
-    for _ in range(40):
+    for _ in range(25):
         trainer.step()
     gains = trainer.exposures.offsets[:, :, :3].diagonal(dim1=1, dim2=2).mean(dim=1)  # [V]
     assert gains[DARK] < -0.03 and (gains[torch.arange(7) != DARK] > gains[DARK] + 0.03).all()
     assert trainer.exposures.offsets.mean(dim=0).abs().max() < 1e-6
-    assert trainer.exposures.steps.tolist() == [40] * 7
+    assert trainer.exposures.steps.tolist() == [25] * 7
 
 
 def test_the_first_iteration_is_that_without_exposures(scene):
@@ -73,7 +73,7 @@ def test_the_first_iteration_is_that_without_exposures(scene):
 @pytest.mark.parametrize("loss", ["charbonnier_ncc", "sparse_ssim"])
 def test_a_run_goes_on_bit_for_bit_and_from_host_memory(scene, loss):
     overrides = ("train.exposure=true", f"loss.type={loss}", "schedule.max_views=2")
-    hosted = (*overrides, "train.maps_place=host", "train.photos_place=host")
+    hosted = (*overrides, "train.pixels_place=host")
     whole, first, second = trainer_of(scene, *overrides), trainer_of(scene, *hosted), trainer_of(scene, *overrides)
     for _ in range(6):
         whole.step()
@@ -86,24 +86,12 @@ def test_a_run_goes_on_bit_for_bit_and_from_host_memory(scene, loss):
     assert_identical(whole.state_dict(), second.state_dict())
 
 
-def test_errors_shown_own_and_aligned_stand_side_by_side(capture, tmp_path):
-    outcome = train(tiny_config(capture, "train.exposure=true"), tmp_path / "on")
-    last = read_history(outcome.folder.history)[-1]
-    assert last.aligned_psnr > max(last.psnr, last.own_psnr) and last.aligned_l1 > 0 and 0 < last.aligned_ssim < 1
-    page = write_report(outcome).read_text()
-    assert "PSNR in dB after colour alignment" in page and "PSNR in dB of the model's own colours" in page
-    off = train(tiny_config(capture), tmp_path / "off")
-    assert math.isnan(read_history(off.folder.history)[-1].aligned_psnr)
-    assert not re.search("aligned|own_", off.folder.history.read_text())
-    assert "alignment" not in write_report(off).read_text()
-    for folder in ("on", "off"):  # so that both can be compared
-        assert "SSIM after colour alignment" in evaluate_run(tmp_path / folder, "cpu")
-
-
 def test_a_saved_run_is_shown_as_its_trainer_is(capture, tmp_path):
     """Test views with the exposures of their neighbours, training views with their own; a file has none."""
     run, scene = tmp_path / "run", load_scene(capture)
     outcome = train(tiny_config(capture, "train.exposure=true"), run)
+    assert 0 < read_history(outcome.folder.history)[-1].own_ssim < 1
+    assert "PSNR in dB of the model's own colours" in write_report(outcome).read_text()
     trainer = outcome.trainer
     state = load_checkpoint(latest_checkpoint(outcome.folder.checkpoints))
     state["trainer"]["exposures"]["offsets"] = torch.linspace(-0.3, 0.2, 7)[:, None, None].expand(7, 3, 4).clone()
@@ -133,29 +121,58 @@ def test_test_views_are_shown_with_what_their_neighbours_have(scene):
     """Nothing but exposures changes: the model's own colours have the errors that they had."""
     trainer = trainer_of(scene, "train.exposure=true")
     views = (trainer.gaussians, scene.test)
-    before = evaluate(*views, trainer.look(scene.test.names), aligned=True).mean
+    before = evaluate(*views, trainer.look(scene.test.names)).mean
     assert before.psnr == before.own_psnr  # every exposure is the identity
     trainer.exposures.offsets += 0.3
-    after = evaluate(*views, trainer.look(scene.test.names), aligned=True).mean
+    after = evaluate(*views, trainer.look(scene.test.names)).mean
     assert (after.own_psnr, after.own_ssim, after.own_l1) == (before.psnr, before.ssim, before.l1)
-    assert after.aligned_psnr == before.aligned_psnr
     own = render_image(trainer.gaussians, scene.test.cameras, 0, sh_degree=0, settings=trainer.config.raster).colors
     shown = (own + 0.3 * own.sum(dim=2, keepdim=True) + 0.3).clamp(0.0, 1.0)
     assert after.l1 == pytest.approx(float((shown - scene.test.photos.image(0)).abs().mean()), abs=1e-6)
 
 
-def test_alignment_is_numpys_least_squares_over_unmasked_pixels():
+NAMES = [f"{number}.jpg" for number in range(40)]
+TRAINED = [name for number, name in enumerate(NAMES) if number % 8]
+TEST = NAMES[::8]
+
+
+def of(gains: torch.Tensor) -> torch.Tensor:
+    """[V, 3, 4]: gains [V] of all channels, with the mean taken off."""
+    offsets = torch.zeros(len(gains), 3, 4)
+    offsets[:, range(3), range(3)] = (gains - gains.mean())[:, None]
+    return offsets
+
+
+def rows(names: list[str]) -> torch.Tensor:
+    return torch.tensor([NAMES.index(name) for name in names])
+
+
+def test_exposures_that_follow_the_sequence_are_told():
+    wave = of(0.4 * torch.sin(torch.arange(40) / 6))
+    told = interpolated_exposures(wave[rows(TRAINED)], TRAINED, TEST)
+    inside = told[1:] - wave[rows(TEST)][1:]  # the first photo has one neighbour
+    assert inside.abs().max() < 0.02 < 0.1 < wave[rows(TEST)].abs().max()
+    assert (told[0] - wave[1]).abs().max() < 0.02
+
+
+def test_exposures_at_random_tell_nothing():
+    """The identity is nearer to the truth than neighbours are, and what is told is nearer to the identity still."""
+    random = torch.Generator().manual_seed(3)
+    noise = of(0.3 * torch.randn(40, generator=random))
+    told = interpolated_exposures(noise[rows(TRAINED)], TRAINED, TEST)
+    assert told.norm() < 0.3 * noise[rows(TEST)].norm()
+
+
+@pytest.mark.parametrize("trained", [["a/1.jpg"], ["a/1.jpg", "a/2.jpg"], ["1.jpg", "2.jpg", "3.jpg"]])
+def test_without_neighbours_or_differences_it_is_the_identity(trained):
+    offsets = torch.zeros(len(trained), 3, 4) if len(trained) == 3 else torch.ones(len(trained), 3, 4)
+    assert not interpolated_exposures(offsets, trained, ["1.png", "b/1.jpg"]).any()
+
+
+def test_exposed_is_the_affine_map_of_each_colour():
     random = torch.Generator().manual_seed(2)
-    image, photo = (torch.rand(12, 14, 3, generator=random) for _ in range(2))
-    mask = torch.rand(12, 14, generator=random) < 0.5
-    rows = np.concatenate([image[mask].numpy(), np.ones((int(mask.sum()), 1))], axis=1).astype(np.float64)
-    affine = np.linalg.lstsq(rows, photo[mask].numpy().astype(np.float64), rcond=None)[0]
-    wanted = np.clip(image.numpy() @ affine[:3] + affine[3], 0.0, 1.0)
-    np.testing.assert_allclose(align_colors(image, photo, mask).numpy(), wanted, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("value", [0.0, 0.4, 1.0])
-def test_an_image_of_one_colour_gets_the_photos_mean(value):
-    photo = torch.rand(12, 14, 3, generator=torch.Generator().manual_seed(3))
-    aligned = align_colors(torch.full_like(photo, value), photo)
-    torch.testing.assert_close(aligned, photo.mean(dim=(0, 1)).expand_as(photo), rtol=0, atol=1e-5)
+    colors, exposure = torch.rand(4, 5, 3, generator=random), 0.3 * torch.randn(3, 4, generator=random)
+    wanted = [color + exposure[:, :3] @ color + exposure[:, 3] for color in colors.reshape(-1, 3)]
+    look = Look(0, RasterSettings(), exposures=torch.stack([torch.zeros(3, 4), exposure]))
+    torch.testing.assert_close(look.colors(colors, 1).reshape(-1, 3), torch.stack(wanted).clamp(0, 1))
+    assert (look.colors(colors, 0) == colors).all()

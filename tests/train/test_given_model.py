@@ -89,16 +89,14 @@ def test_a_given_model_has_the_tables_and_pictures_of_its_run(turbogs, finished,
         code, out, error = turbogs("eval", file, "--scene", capture, "--device", "cpu")
         assert (code, table(out), error) == (0, asked, "")
         assert f"{file}, " in out
-    assert turbogs("render", finished, "--device", "cpu", "--depth")[0] == 0
-    given = ("--scene", capture, "--out", pictures, "--device", "cpu", "--depth")
+    assert turbogs("render", finished, "--device", "cpu")[0] == 0
+    given = ("--scene", capture, "--out", pictures, "--device", "cpu")
     assert turbogs("render", finished / "model.ply", *given)[0] == 0
-    for folder in ("test", "test-depth"):
-        names = [path.name for path in sorted((finished / "renders" / folder).glob("*.png"))]
-        assert names == [path.name for path in sorted((pictures / folder).glob("*.png"))] and names
-        for name in names:
-            ours, theirs = (np.asarray(Image.open(place / folder / name), dtype=int) for place in (
-                finished / "renders", pictures))  # fmt: skip
-            assert np.abs(ours - theirs).mean() < 0.1
+    ours, theirs = (
+        [np.asarray(Image.open(path), dtype=int) for path in sorted(place.glob("test/*.png"))]
+        for place in (finished / "renders", pictures)
+    )
+    assert ours and np.abs(np.stack(ours) - np.stack(theirs)).mean() < 0.1
 
 
 @pytest.mark.parametrize("world", range(4))
@@ -121,12 +119,12 @@ def test_the_world_is_said_by_a_setting_in_training_and_evaluation(turbogs, fini
     torch.testing.assert_close(
         Trainer(config, load_scene(capture), CPU).gaussians.means, trained.means, atol=1e-3, rtol=0
     )
-    given = ("eval", file, "--scene", capture, "--device", "cpu")
-    wrong, right = (
-        float(re.search(r"mean of 1\W+([\d.]+)", turbogs(*given, *setting)[1])[1])
-        for setting in ((), ("train.init_world=gsplat",))
+    given = ("eval", file, "--scene", capture, "--device", "cpu", "train.init_world=gsplat")
+    measured, expected = (
+        float(re.search(r"mean of 1\W+([\d.]+)", turbogs(*call)[1])[1])
+        for call in (given, ("eval", finished, "--device", "cpu"))
     )
-    assert right > wrong + 1.0
+    assert measured == pytest.approx(expected, abs=0.2)
     checkpoint = latest_checkpoint(finished / "checkpoints")  # knows its frame
     assert_alike(load_given(checkpoint, load_scene(capture), "gsplat"), trained)
 
@@ -175,17 +173,6 @@ def test_training_starts_from_a_model_where_that_had_ended(finished, capture, tm
     assert Path(run.RunFolder(tmp_path / "run").read_config().train.init) == finished / "model.ply"
 
 
-def test_bands_are_added_or_dropped_as_the_run_has_them(finished, capture):
-    scene, model = load_scene(capture), load_model(finished, CPU).gaussians
-    for degree, bands in ((0, 0), (1, 3), (3, 15)):
-        config = tiny_config(capture, f"train.sh_degree={degree}", f"train.init={finished}").without_plan()
-        trainer = Trainer(config, scene, CPU)
-        shared = min(bands, model.shN.shape[1])
-        assert trainer.sh_degree == degree and trainer.gaussians.shN.shape[1] == bands
-        torch.testing.assert_close(trainer.gaussians.shN[:, :shared], model.shN[:, :shared])
-        assert not trainer.gaussians.shN[:, shared:].any()
-
-
 def test_a_stopped_run_goes_on_without_the_model_that_it_started_from(finished, capture, tmp_path):
     start = Path(shutil.copy(finished / "model.ply", tmp_path / "start.ply"))
     short = ("train.iterations=6", "train.refine_until=5", "train.checkpoint_every=3", "train.evaluate_at=[]")
@@ -222,36 +209,33 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
 
     empty = folder / "empty"
     empty.mkdir()
-    model = random_gaussians(5)
     broken = random_gaussians(5).map(lambda value: value * torch.nan)
-    whole = save_splats(folder / "whole.pt", model).read_bytes()
     return {
         "absent": (folder / "absent.ply", "no such model"),
-        "another kind": (written("model.obj", b"x"), "a .ply, .splat, .spz or gsplat's .pt"),
+        "another kind": (written("model.obj", b"x"), "a .ply, .spz or gsplat's .pt"),
         "empty folder": (empty, "without a checkpoint of a run"),
         "no archive": (written("text.pt", b"text"), "not a whole file of torch.save"),
-        "cut": (written("cut.pt", whole[:-300]), "cannot be used"),
         "other keys": (saved("weights.pt", {"conv1": torch.zeros(3), "bias": torch.zeros(1)}), "bias, conv1"),
-        "a list": (saved("list.pt", [torch.zeros(3)]), "it has list): give a .ply"),
         "code": (saved("code.pt", {"splats": Path("x")}), "more than plain tensors"),
         "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
-        "no rows": (save_splats(folder / "none.pt", model.map(lambda value: value[:0])), "holds no Gaussians: export"),
         "not a ply": (written("text.ply", b"text"), "not a .ply file"),
-        "not a splat": (written("text.splat", b"text"), "rows of 32; export it again, or name another file"),
         "not a spz": (written("text.spz", b"text"), "cannot read"),
-        "not compressed": (written("a.ply", b"ply\nelement chunk 1\nend_header\n"), "not a compressed .ply"),
     }
 
 
 def test_what_is_no_model_is_one_line(turbogs, capture, tmp_path):
     out = tmp_path / "out"
     for what, (file, words) in bad_files(tmp_path).items():
-        calls = [
-            ("train", capture, "--init", file, "--out", out),
-            ("eval", file, "--scene", capture),
-            ("render", file, "--scene", capture, "--out", out),
-            ("export", file, "--scene", capture, "--out", out.with_suffix(".ply")),
-        ]
+        calls = (
+            [("eval", file, "--scene", capture)]
+            if what != "absent"
+            else [
+                ("train", capture, "--init", file, "--out", out),
+                ("eval", file, "--scene", capture),
+                ("render", file, "--scene", capture, "--out", out),
+                ("export", file, "--scene", capture, "--out", out.with_suffix(".ply")),
+            ]
+        )
         for call in calls:
             code, printed, error = turbogs(*call)
             assert code == 2 and printed == "" and error.count("\n") == 1, (what, call[0], error)

@@ -10,10 +10,12 @@ from helpers.framework_runs import tiny_capture, tiny_config
 from torch import Tensor
 
 from turbogs_plugin.captures import load_scene
+from turbogs_plugin.engine.reference.raster import kept
 from turbogs_plugin.engine.render import render_image
+from turbogs_plugin.engine.rules import Dropout
 from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.metrics import evaluate, render_view
-from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.train.trainer import DROPOUT_UNTIL, Trainer
 from turbogs_plugin.types import RowUpdate
 
 CPU = torch.device("cpu")
@@ -110,3 +112,22 @@ def test_an_evaluation_measures_what_a_screen_shows(scene):
     assert float(render_view(trainer.gaussians, scene.test, 0, Look(0, settings)).max()) == 1.0
     metrics = evaluate(trainer.gaussians, scene.test, Look(0, settings))
     assert metrics.mean.l1 <= 1.0 and metrics.mean.psnr >= 0.0
+
+
+def test_what_an_iteration_leaves_out_does_not_learn_and_the_end_has_all(scene):
+    still = ("density.refine_from=1000", "density.final_keep=1", "train.distant_size=0")
+    trainer = make_trainer(scene, "train.dropout=0.4", "train.iterations=20", *still)
+    trainer.initialise_maps()
+    ever_left = torch.zeros(len(trainer.gaussians), dtype=torch.bool)
+    for iteration in range(20):
+        share = 0.4 if iteration < DROPOUT_UNTIL * 20 else 0.0
+        stay = kept(Dropout(share, trainer.config.train.seed, iteration), len(trainer.gaussians), CPU)
+        assert (stay is None) == (iteration >= 19)  # 0.95 of 20
+        before = trainer.gaussians.map(torch.clone)
+        trainer.step()
+        if stay is not None:
+            ever_left |= ~stay
+            for name, value in trainer.gaussians.items():
+                assert torch.equal(value[~stay], getattr(before, name)[~stay])
+            assert not torch.equal(trainer.gaussians.means[stay], before.means[stay])
+    assert ever_left.double().mean() > 0.99

@@ -107,14 +107,6 @@ def test_no_iteration_is_missing_at_a_stop():
     assert diary.lines == [("begun", 0), ("evaluation", 3), ("checkpoint", 3)]
 
 
-def test_a_stop_before_the_first_iteration_makes_none():
-    trainer = CountingTrainer(6)
-    loop = TrainingLoop(trainer)
-    loop.stop()
-    loop.run()
-    assert trainer.initialised and trainer.steps == [] and not loop.finished
-
-
 def test_only_training_is_on_the_clock(monkeypatch):
     """An hour of evaluations takes no time; an iteration takes a second, and so do the maps."""
     clock = SimulatedTime(monkeypatch)

@@ -14,9 +14,6 @@ from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.render import rasterize, render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
-from turbogs_plugin.report.evaluation import evaluate_run
-from turbogs_plugin.report.images import MASKED, strip
-from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.strategies.losses import CharbonnierLoss
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler
@@ -91,7 +88,7 @@ class ForeignLoss:
         ("pixel_sampler.unit=tile", "loss.type=sparse_ssim"),
         ("pixel_sampler.type=random",),
         ("pixel_sampler.type=dense", "train.backdrop=true"),
-        ("train.maps_place=host", "train.photos_place=host"),
+        ("train.pixels_place=host",),
         ("pixel_sampler.importance=0.5", "loss.type=charbonnier"),
         "foreign",
     ],
@@ -166,15 +163,6 @@ def test_errors_are_those_of_unmasked_pixels(scene):
     assert (changed.psnr, changed.ssim, changed.l1) == tuple(
         getattr(metrics.views[0], name) for name in ("psnr", "ssim", "l1")
     )
-
-
-def test_a_run_says_that_masked_pixels_do_not_count(capture, tmp_path):
-    session = train(tiny_config(capture, "train.iterations=2"), tmp_path / "run", write_report)
-    page = (tmp_path / "run/report.md").read_text()
-    assert "without their masked pixels" in page
-    assert f"{session.history[-1].psnr:.4f}" in evaluate_run(tmp_path / "run", "cpu")
-    picture = strip(torch.ones(40, 48, 3), torch.zeros(40, 48, 3), torch.from_numpy(disc_mask(0)))
-    assert (picture[39, 47] == MASKED).all() and (picture[14, 12] == 255).all()
 
 
 def test_a_run_is_not_resumed_with_other_masks(capture, tmp_path):

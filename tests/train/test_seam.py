@@ -10,7 +10,6 @@ from helpers.framework_runs import tiny_config
 from helpers.losing_engine import LosingEngine
 
 from turbogs_plugin.captures.load import load_scene
-from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
@@ -101,23 +100,6 @@ def test_statistics_are_written_once_whatever_the_optimizer_does(capture, calls)
     for item in fields(usual.density.stats):
         found, expected = getattr(odd.density.stats, item.name), getattr(usual.density.stats, item.name)
         assert torch.equal(found, expected), item.name
-
-
-def test_the_engine_gets_rule_moments_and_statistics(capture, monkeypatch):
-    trainer, calls = make_trainer(capture), []
-    engine = type(trainer.engine)
-
-    def update(self, *arguments):
-        calls.append(arguments)
-
-    monkeypatch.setattr(engine, "update", update)
-    stats, step, before = trainer.density.stats, trainer.now, trainer.gaussians.means.clone()
-    trainer.step()
-    ((rule, screen, gaussians, moments, given),) = calls
-    assert rule == trainer.optimizer.rule(step) and moments is trainer.optimizer.moments and given is stats
-    assert gaussians is trainer.gaussians and torch.equal(gaussians.means, before)
-    apply_update(rule, gaussians, screen.parameter_gradients(rule.per_view, stats), moments)
-    assert not torch.equal(gaussians.means, before)
 
 
 class Restless:

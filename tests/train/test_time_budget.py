@@ -1,6 +1,5 @@
 """Whole runs within budgets."""
 
-import math
 import os
 import signal
 from pathlib import Path
@@ -17,7 +16,7 @@ from turbogs_plugin.config.sections import TrainConfig
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.train import pace as pacing
 from turbogs_plugin.train import run, session
-from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.trainer import Trainer
@@ -152,25 +151,18 @@ def change_config(folder: Path, **sections: dict) -> None:
     (folder / "config.yaml").write_text(resolve(mapping).to_yaml())
 
 
-@pytest.mark.parametrize("place", [(Trainer, "__init__"), (session, "place_views")])
-def test_a_capture_that_does_not_fit_is_refused(capture, tmp_path, monkeypatch, place):
-    def full(*arguments, **options):
-        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
-
-    monkeypatch.setattr(*place, full)
-    with pytest.raises(InputError, match=r"does not fit into the device's memory: use train\.photos_place=host"):
-        run.train(tiny_config(capture), tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.parametrize("place", [(Trainer, "__init__"), (Trainer, "load_state_dict"), (session, "place_views")])
-def test_a_run_that_no_longer_fits_is_not_resumed(stopped, monkeypatch, place):
+def test_a_capture_that_does_not_fit_is_refused(capture, stopped, tmp_path, monkeypatch, place):
     def full(*arguments, **options):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(*place, full)
-    with pytest.raises(InputError, match="'capture' does not fit into the device's memory: end what else"):
+    with pytest.raises(InputError, match=r"'capture' does not fit .*: use train\.pixels_place=host"):
         run.resume(stopped)
+    if place[1] != "load_state_dict":
+        with pytest.raises(InputError, match=r"does not fit into the device's memory"):
+            run.train(tiny_config(capture), tmp_path / "new")
+        assert not (tmp_path / "new").exists()
 
 
 def test_a_resumed_run_is_held_to_its_memory(stopped, monkeypatch):
@@ -186,13 +178,6 @@ def test_a_resumed_run_is_held_to_its_memory(stopped, monkeypatch):
     monkeypatch.setattr(run, "hold_to_limit", lambda config, device: held.append(config.budget.memory_bytes()))
     monkeypatch.setattr(Trainer, "__init__", building)
     assert run.resume(stopped).signal is None
-
-
-def test_a_run_of_a_gpu_is_not_told_to_resume_on_a_cpu(turbogs, stopped, monkeypatch):
-    change_config(stopped, train={"device": "cuda"})
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    code, _, error = turbogs("train", "--resume", stopped)
-    assert code == 2 and "go on with this run where there is a GPU" in error and "--device" not in error
 
 
 def test_memory_that_is_spent_names_what_may_fit(capture, tmp_path, monkeypatch):
@@ -232,32 +217,3 @@ def test_stops_by_time_evaluate_once_a_fraction_and_save_at_intervals():
     assert len(saved) == 200 // 40 and saved[-1] == pace.iterations == pytest.approx(200, abs=2)
     assert pace.refine_until == pytest.approx(140, abs=3)
     assert (train.iterations, train.refine_until) == (100, 70), "the configuration stays what was resolved"
-
-
-def paced(stop_after: float = math.inf) -> list[tuple[int, float, int, int]]:
-    """(iteration, seconds, iterations planned, end of density control) at each stop of a run of 20 s, whose model grows
-    to 20 times its size; stopped and resumed once."""
-    train = TrainConfig(iterations=5000, refine_until=3500)
-    pace = pacing.Pace(train, 20.0)
-    iteration, seconds, gaussians, stops = 0, 0.0, 20_000, []
-    while iteration < pace.iterations:
-        mark = pace.next_mark(iteration, seconds)
-        while iteration < mark:
-            seconds += 1e-3 + 1e-8 * gaussians
-            iteration += 1
-            gaussians += 100 * (iteration < pace.refine_until)
-        pace.reached(iteration, seconds)
-        stops.append((iteration, seconds, pace.iterations, pace.refine_until))
-        if seconds > stop_after:
-            state, stop_after = pace.state_dict(), math.inf
-            pace = pacing.Pace(train, 20.0)
-            require_like(state, pace.state_dict(), "pace")
-            pace.load_state_dict(state)
-    return stops
-
-
-@pytest.mark.parametrize("seconds", [0.1, 4.0, 15.0])
-def test_the_plan_of_a_resumed_run_goes_on_where_it_was(seconds):
-    stops = paced()
-    assert paced(stop_after=seconds) == stops
-    assert stops[-1][1] == pytest.approx(20.0, abs=0.01) and stops[-1][3] == pytest.approx(0.7 * stops[-1][0], rel=0.1)

@@ -23,8 +23,7 @@ from PIL import Image
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import Config, load_config, resolve
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.model.ply import load_ply
-from turbogs_plugin.model.row_order import spatial_order
+from turbogs_plugin.files import require_writable
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.strategies.protocols import PixelSampler, SparseLoss
@@ -55,13 +54,13 @@ def test_a_run_leaves_everything_that_it_promises(whole, capture):
     assert [line["iteration"] for line in history] == [0, 7, 14]
     for line in history:
         assert {"train_seconds", "psnr", "ssim", "l1", "num_gaussians", "memory_bytes"} <= set(line)
-        assert all(np.isfinite(value) for value in line.values())
+        assert all(np.isfinite(line[name]) for name in ("psnr", "ssim", "l1", "worst_psnr", "train_seconds"))
     assert history[-1]["psnr"] > history[0]["psnr"] + 1.0
     assert [line["train_seconds"] for line in history] == sorted(line["train_seconds"] for line in history)
     assert history[-1]["nonfinite_losses"] == history[-1]["skipped_updates"] == 0
 
     page = folder.report.read_text()
-    said = ("LPIPS was not computed", "FPS", f"FLIP: `turbogs eval {folder.path}`")
+    said = ("LPIPS was not computed", "FPS")
     for promised in ("psnr.png", "l1.png", "test-000.jpg", "iterations: 14", "gsplat", *said):
         assert promised in page
     for name in ("psnr.png", "l1.png", "test-000.jpg"):
@@ -88,15 +87,6 @@ def test_moments_and_statistics_follow_their_gaussians(capture):
     for rows in (moments.exp_avg[:, 0], moments.exp_avg_shN[:, 0], trainer.density.stats.error_sums):
         assert int((rows == 0).sum()) == 9
         assert torch.equal(rows, torch.where(rows == 0, 0.0, tags))
-
-
-def test_the_exported_model_is_the_trained_one_in_the_capture_frame(whole, capture):
-    exported = load_ply(whole.folder.model)
-    trained = saved(whole.folder.path)["gaussians"]
-    frame = load_scene(capture).frame
-    expected = frame.restore_points(trained["means"].double().numpy())
-    assert np.allclose(exported.means.double().numpy(), expected, atol=1e-5 * abs(expected).max())
-    assert torch.equal(exported.sh0, trained["sh0"])
 
 
 STOPS = {
@@ -172,7 +162,7 @@ def test_sigterm_before_training_ends_the_process_without_a_trace(capture):
         "import os, signal, sys; from turbogs_plugin.captures import load_scene\n"
         "load_scene(sys.argv[1]); os.kill(os.getpid(), signal.SIGTERM)"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(capture)], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code, str(capture)], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, "", "")
 
 
@@ -193,7 +183,7 @@ def test_a_model_that_is_not_finite_is_never_saved(capture, tmp_path, monkeypatc
         trainer.gaussians.means[3] = torch.nan
 
     stop_after(monkeypatch, 10, spoil)
-    with pytest.raises(TrainingStopped, match=r"iteration 10: means of 1 of \d+ Gaussians.*iteration-000005\.pt"):
+    with pytest.raises(TrainingStopped, match=r"iteration 10: 1 of \d+ Gaussians.*iteration-000005\.pt"):
         run.train(tiny_config(capture), tmp_path / "run")
     assert saved(tmp_path / "run")["iteration"] == 5
     assert all(value.isfinite().all() for value in saved(tmp_path / "run")["gaussians"].values())
@@ -207,18 +197,6 @@ def test_a_model_without_gaussians_ends_the_run_with_a_reason(capture, tmp_path,
     stop_after(monkeypatch, 7, all_gone)
     with pytest.raises(TrainingStopped, match=r"iteration 7: .*every Gaussian.*iteration-000005\.pt"):
         run.train(tiny_config(capture), tmp_path / "run")
-
-
-def test_rows_are_in_the_order_of_space_whatever_added_them(capture):
-    trainer = Trainer(tiny_config(capture).without_plan(), load_scene(capture), torch.device("cpu"))
-    count = len(trainer.gaussians)
-    trainer.initialise_maps()
-    while len(trainer.gaussians) == count:
-        trainer.step()
-    rows = torch.arange(len(trainer.gaussians))
-    assert len(rows) > count
-    assert torch.equal(spatial_order(trainer.gaussians.means, trainer.extent), rows)
-    assert len(trainer.density.stats.weight_sums) == len(rows)
 
 
 def test_non_finite_losses_are_counted(capture, tmp_path, monkeypatch):
@@ -236,49 +214,8 @@ def test_non_finite_losses_are_counted(capture, tmp_path, monkeypatch):
     assert "non-finite loss: 4" in outcome.folder.report.read_text()
 
 
-@pytest.fixture
-def elsewhere(capture, whole, tmp_path) -> Path:
-    """A copy of the capture, of which a copy of the run tells."""
-    shutil.copytree(whole.folder.path, tmp_path / "run")
-    config = whole.folder.read_config()
-    config.scene.path = str(tmp_path / "capture")
-    (tmp_path / "run" / "config.yaml").write_text(config.to_yaml())
-    return shutil.copytree(capture, tmp_path / "capture")
-
-
-def moved(by: pycolmap.Sim3d):
-    return lambda reconstruction: reconstruction.transform(by)
-
-
-def renamed(reconstruction) -> None:
-    """Two photos change places."""
-    images = sorted(reconstruction.images.values(), key=lambda image: image.name)
-    images[1].name, images[2].name = images[2].name, images[1].name
-
-
-TURN = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.01, 1.0]))
-
-
-@pytest.mark.parametrize(
-    ("change", "difference"),
-    [
-        (moved(pycolmap.Sim3d(1.0, TURN, np.zeros(3))), "other cameras of train images"),
-        (moved(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(), np.zeros(3))), "other coordinates"),
-        (renamed, "other cameras of train images"),
-    ],
-    ids=["turned", "scaled", "renamed"],
-)
-def test_a_capture_made_anew_since_the_run_began_is_refused(elsewhere, tmp_path, change, difference):
-    reconstruction = pycolmap.Reconstruction(elsewhere / "sparse" / "0")
-    change(reconstruction)
-    reconstruction.write_binary(elsewhere / "sparse" / "0")
-    before = latest_checkpoint(tmp_path / "run" / "checkpoints").read_bytes()
-    with pytest.raises(InputError, match=rf"capture '.*capture' has {difference} than .*run' began: .*another --out"):
-        run.resume(tmp_path / "run")
-    assert latest_checkpoint(tmp_path / "run" / "checkpoints").read_bytes() == before
-
-
-def test_a_capture_read_with_other_rounding_is_the_same(capture):
+def test_a_capture_made_anew_since_the_run_began_is_refused(capture, whole, tmp_path):
+    """Turned by a hundredth, say; two readings of one reconstruction differ by less."""
     saved, present = (capture_state(load_scene(capture)) for _ in range(2))
     for views in (present["train_views"], present["test_views"]):
         views["viewmats"] += 2e-6
@@ -286,6 +223,22 @@ def test_a_capture_read_with_other_rounding_is_the_same(capture):
     assert capture_difference(saved, present) == ""
     present["test_views"]["viewmats"][0, 0, 3] += 2e-5
     assert capture_difference(saved, present) == "other cameras of test images"
+    scaled = saved | {"frame": saved["frame"] | {"scale": 2 * saved["frame"]["scale"]}}
+    assert capture_difference(saved, scaled) == "other coordinates"
+
+    run_folder = Path(shutil.copytree(whole.folder.path, tmp_path / "run"))
+    config = whole.folder.read_config()
+    config.scene.path = str(shutil.copytree(capture, tmp_path / "capture"))
+    (run_folder / "config.yaml").write_text(config.to_yaml())
+    reconstruction = pycolmap.Reconstruction(tmp_path / "capture/sparse/0")
+    turn = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.01, 1.0]))
+    reconstruction.transform(pycolmap.Sim3d(1.0, turn, np.zeros(3)))
+    reconstruction.write_binary(tmp_path / "capture/sparse/0")
+    before = latest_checkpoint(run_folder / "checkpoints").read_bytes()
+    words = r"capture '.*capture' has other cameras of train images than .*run' began: .*another --out"
+    with pytest.raises(InputError, match=words):
+        run.resume(run_folder)
+    assert latest_checkpoint(run_folder / "checkpoints").read_bytes() == before
 
 
 @pytest.mark.parametrize(("size", "expected"), [(0.0, 40.0), (0.3, 0.3 * 14.0)])
@@ -367,3 +320,26 @@ def test_what_a_strategy_of_ones_own_returns_is_refused_and_nothing_is_left(
     with pytest.raises(InputError, match=message):
         run.train(tiny_config(capture, "schedule.min_views=3", "view_sampler.type=random"), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_not_resumed(capture, tmp_path, monkeypatch):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.yaml").write_text(tiny_config(capture).without_plan().to_yaml())
+
+    def refused(folder: Path, given: str) -> None:
+        require_writable(folder / "config.yaml" / "file", given)  # whoever runs this may write to any folder
+
+    monkeypatch.setattr(run, "require_writable", refused)
+    with pytest.raises(InputError, match=r"what --resume .*run writes cannot be made in .*: choose a folder"):
+        run.resume(tmp_path / "run")
+
+
+SHORT = ("train.iterations=2", "train.refine_until=1", "train.device=cpu")
+
+
+def test_a_folder_is_read_as_the_section_scene_says(capture):
+    models = [run.fit(given, *SHORT, "scene.factor=2") for given in (str(capture), capture, load_scene(capture, 2))]
+    whole = run.fit(load_scene(capture), *SHORT)
+    for name, value in models[2].items():
+        assert all(torch.equal(getattr(model, name), value) for model in models[:2])
+    assert not torch.equal(whole.sh0, models[0].sh0)

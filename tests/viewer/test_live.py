@@ -71,7 +71,7 @@ def watched(new_training, scene, monkeypatch):
 @pytest.mark.parametrize("place", ["device", "host"])
 def test_a_watched_training_ends_as_an_unwatched_one(unwatched, watched, monkeypatch, place):
     monkeypatch.setitem(frames.SHORTEST_INTERVALS, True, 0.0)
-    page, _, loop = watched(f"train.maps_place={place}", f"train.photos_place={place}")
+    page, _, loop = watched(f"train.pixels_place={place}")
     loop.run()
     assert len(page.pictures) >= loop.trainer.iteration > 10 and len({frame.tobytes() for frame in page.pictures}) > 6
     assert_identical(loop.trainer.state_dict(), unwatched)

@@ -41,7 +41,7 @@ class RunOptions:
             host if need be, then the number of Gaussians is limited.
         time_budget: time of training to end after: 20s, 2m (budget.time). The schedule is fitted to it.
         init: start of the model (train.init): points of the capture, random points, or a model trained anywhere: a
-            .ply, .splat, .spz, gsplat's .pt, a checkpoint, or a run's folder.
+            .ply, .spz, gsplat's .pt, a checkpoint, or a run's folder.
     """
 
     config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None
@@ -54,8 +54,8 @@ class RunOptions:
 
     def settings(self, scene: Path | None, overrides: tuple[str, ...]) -> Config:
         """The configuration that a command line asks for. `scene`: None leaves the capture open."""
-        from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config, require_one_length
-        from turbogs_plugin.plan.caps import with_cap
+        from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
+        from turbogs_plugin.plan.memory import with_cap
 
         if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
             raise InputError("scene.path is what SCENE says: leave the override out")
@@ -66,7 +66,6 @@ class RunOptions:
         more = [f"{name}={json.dumps(value)}" for name, value in given.items() if value is not None]
         asked = DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *more)
         settings = load_config(*asked)
-        require_one_length(asked[1])
         if self.max_gaussians is not None:
             settings = with_cap(settings, self.max_gaussians)
         if scene is not None:
@@ -83,8 +82,7 @@ class GivenOptions:
     """Options of eval, render, export and view for a model in the place of a run.
 
     Args:
-        scene: the capture of a model from a file: a 3DGS .ply, .splat, .spz, gsplat's .pt, or a checkpoint. Not with
-            a run.
+        scene: the capture of a model from a file: a 3DGS .ply, .spz, gsplat's .pt, or a checkpoint. Not with a run.
         factor: scale its photos down by this.
     """
 

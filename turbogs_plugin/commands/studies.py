@@ -38,7 +38,6 @@ def ablate(
         gpus: number of this machine's GPUs, each of which trains a cell at a time.
         device: where to train.
     """
-    from turbogs_plugin.config.configuration import require_one_length
     from turbogs_plugin.study.grid import load_ablation
     from turbogs_plugin.study.run_cells import CellChoice, run_study
 
@@ -46,7 +45,6 @@ def ablate(
         raise InputError("ablate needs --scene SCENE: the folder of a capture")
     for option, count in (("--steps", steps), ("--gpus", gpus)):
         require_positive(option, () if count is None else (count,))
-    require_one_length(overrides)
     choice = CellChoice(scene, seeds, only, overrides, steps, device)
     failures = run_study(load_ablation(name), choice, out, gpus)
     for failure in failures:

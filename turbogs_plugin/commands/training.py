@@ -121,7 +121,7 @@ def plan(
         scene, overrides = None, (str(scene), *overrides)
     settings = options.settings(scene, overrides)
     if scene is None:
-        from turbogs_plugin.config.listing import settings_text
+        from turbogs_plugin.config.configuration import settings_text
 
         print(settings_text(settings))
         return 0

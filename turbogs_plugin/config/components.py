@@ -74,7 +74,7 @@ def build(kind: str, mapping: Any) -> Any:
     type_name = mapping.get("type", default_type(kind))
     found = strategy_class(kind, type_name)
     options = {key: value for key, value in mapping.items() if key != "type"}
-    strategy: Any = build_dataclass(found, options, kind, also=("type",))
+    strategy: Any = build_dataclass(found, options, kind)
     # Run-time state counts as present, and no value is read: reading may need `setup`.
     present = {*dir(found), *(field.name for field in fields(strategy))}
     protocol = getattr(protocols, PROTOCOLS[kind])

@@ -8,17 +8,18 @@ file is looked for beside it. The plan of a run decides settings that are ``auto
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
+from textwrap import indent
 from typing import Any, get_type_hints
 
-from turbogs_plugin.config.components import KINDS, build, default_type
+from turbogs_plugin.config.components import KINDS, build, default_type, strategy_class
 from turbogs_plugin.config.sections import (
     AUTO,
     AUTO_SETTINGS,
-    WRITTEN_FOR,
     BudgetConfig,
     MapsConfig,
     ReportConfig,
@@ -29,6 +30,7 @@ from turbogs_plugin.config.sections import (
 from turbogs_plugin.config.typed import build_dataclass, dataclass_mapping
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.errors import InputError, nearest
+from turbogs_plugin.strategies import TYPES
 from turbogs_plugin.yaml_json import packaged_names, parse_yaml, read_named_yaml, yaml_text
 
 PACKAGE = "turbogs_plugin.configs"
@@ -73,12 +75,9 @@ class Config:
 
     def without_plan(self) -> Config:
         """This configuration, decided for a run that looks at neither scene nor machine, such as a benchmark."""
-        mapping = self.to_mapping()
-        for setting in undecided(mapping):
-            section, key = setting.split(".")
-            value = AUTO_SETTINGS[setting]
-            mapping[section][key] = WRITTEN_FOR if value is None else value
-        return resolve(mapping)
+        decided = vars(TrainConfig(pixels_place="device"))  # the defaults
+        left = {name: decided[name] for name in AUTO_SETTINGS if getattr(self.train, name) == AUTO}
+        return self.changed(train=left)
 
     def changed(self, **sections: Mapping[str, Any]) -> Config:
         """This configuration with values of some sections replaced; a section with a `type` starts afresh."""
@@ -117,19 +116,18 @@ def load_config(name_or_file: str = DEFAULT_CONFIG, overrides: Sequence[str] = (
     return resolve(apply_overrides(_load_mapping(name_or_file), overrides))
 
 
-def require_one_length(overrides: Sequence[str]) -> None:
-    """Raise `InputError` where overrides ask for a time budget and a number of iterations.
-
-    Args:
-        overrides: as for `load_config`. A number in a YAML is the length of a run without a time budget.
-    """
-    asked = apply_overrides({}, overrides)
-    iterations, seconds = asked.get("train", {}).get("iterations"), asked.get("budget", {}).get("time")
-    if seconds and iterations not in (None, AUTO):
-        raise InputError(
-            f"train.iterations={iterations} and the time budget {seconds} exclude each other: leave one out, or "
-            f"write train.iterations={AUTO}"
-        )
+def settings_text(config: Config) -> str:
+    """The configuration as YAML, with the docstrings of a section's classes above it, which say what settings mean."""
+    parts = []
+    for section, values in config.to_mapping().items():
+        cls = SECTION_CLASSES.get(section) or strategy_class(section, values["type"])
+        nested = [hint for name, hint in get_type_hints(cls).items() if name in values and is_dataclass(hint)]
+        owners = [owner for owner in (*reversed(cls.__mro__), *nested) if is_dataclass(owner)]
+        said = [inspect.cleandoc(owner.__doc__ or "") for owner in owners]
+        if section in TYPES:
+            said.append(f"Types: {', '.join(TYPES[section])}.")
+        parts.append(indent("\n\n".join(said), "# ") + "\n" + yaml_text({section: values}))
+    return "\n".join(parts)
 
 
 def resolve(mapping: Mapping[str, Any]) -> Config:
@@ -161,12 +159,8 @@ def resolve_complete(mapping: Mapping[str, Any], where: str, decided: bool = Fal
         config = resolve(mapping)
     except InputError as error:
         raise InputError(f"'{where}': {error}; bring back what was written there") from None
-    missing = [name for name, section in config.to_mapping().items() if mapping.get(name) != section]
-    if missing:
-        raise InputError(f"'{where}' lacks settings of '{missing[0]}' that a run writes: bring it back, or train anew")
-    left = undecided(mapping) if decided else []
-    if left:
-        raise InputError(f"'{where}' has {AUTO} for {', '.join(left)}, which a run decides: bring the file back")
+    if mapping != config.to_mapping() or (decided and undecided(mapping)):
+        raise InputError(f"'{where}' lacks settings that a run writes: bring the file back, or train anew")
     return config
 
 

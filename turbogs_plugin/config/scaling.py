@@ -4,7 +4,6 @@ iteration, and the learning rates, to more processes."""
 from __future__ import annotations
 
 from turbogs_plugin.config.configuration import Config, resolve
-from turbogs_plugin.errors import InputError
 
 ITERATION_FIELDS = {
     "train": ("refine_until", "sh_interval"),
@@ -25,12 +24,7 @@ def with_iterations(config: Config, iterations: int) -> Config:
     """The configuration for a run of exactly this length, with everything scaled that counts iterations.
 
     Intervals of density control stay at `SHORTEST_INTERVAL` or above; 0 stays 0.
-
-    Raises:
-        InputError: no iterations.
     """
-    if iterations < 1:
-        raise InputError(f"a run has at least one iteration, not {iterations}")
     mapping, factor = config.to_mapping(), iterations / config.train.written_iterations
     density = mapping["density"]
     interval = density.get("refine_every", REGROWTH)

@@ -23,27 +23,15 @@ LONGEST_TIME = 100 * 3600.0
 Auto = Literal["auto"]
 """The type of `AUTO`."""
 
-AUTO_SETTINGS: dict[str, Any] = {
-    "train.backdrop": False,
-    "train.background": "black",
-    "train.exposure": False,
-    "train.dropout": 0.0,
-    "train.batch_for": 1,
-    "train.iterations": None,
-    "train.maps_place": "device",
-    "train.photos_place": "device",
-}
-"""Setting that may be ``auto`` -> its value if no plan is made; None: `WRITTEN_FOR`. What a plan makes of ``auto`` is
-decided in `turbogs_plugin.plan.decisions`. `train.device` is not among them, as a plan is made for a given device."""
+AUTO_SETTINGS = ("backdrop", "background", "exposure", "dropout", "batch_for", "iterations", "pixels_place")
+"""Settings of the section `train` that may be ``auto``; what a plan makes of it: `turbogs_plugin.plan.decisions`.
+`device` is not among them, as a plan is made for a given device."""
 
 STRIPS = 8
 """Test views that a report, and TensorBoard, show as pictures, at most."""
 
 WRITTEN_FOR = 5000
 """Iterations for which the settings that count iterations are written where `train.iterations` is ``auto``."""
-
-Place = Literal["auto", "device", "host"]
-"""Where large tensors are: on the device, or in pinned memory of the host, from where a window of them travels."""
 
 
 @dataclass
@@ -84,8 +72,8 @@ class TrainConfig:
             sampling.
         seed: seed of all random numbers.
         device: ``cpu``, ``cuda``, or ``auto``: CUDA where there is a GPU.
-        maps_place: where error and age maps are (`Place`). Changes no result.
-        photos_place: where photos are (`Place`). Changes no result.
+        pixels_place: where photos, error and age maps are: on the device, or in pinned memory of the host, from where a
+            window of them travels. Changes no result.
         init: what training starts from: ``points`` of the capture; ``random`` points, in a cube about what the cameras
             look at; or a model's file, a .ply, gsplat's .pt, a checkpoint or a run's folder. A model is taken as it is:
             all its bands are in use from the start, and `initial_opacity` and `initial_size` change nothing.
@@ -126,8 +114,7 @@ class TrainConfig:
     refine_until: int = 3500
     seed: int = 0
     device: str = "auto"
-    maps_place: Place = "auto"
-    photos_place: Place = "auto"
+    pixels_place: Literal["auto", "device", "host"] = "auto"
     init: str = "points"
     init_world: Literal["capture", "gsplat"] = "capture"
     refine_cameras: bool = False
@@ -237,14 +224,8 @@ class BudgetConfig:
 
 
 def undecided(mapping: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The settings of a complete configuration that are left to a plan."""
-    return [setting for setting in AUTO_SETTINGS if value_of(mapping, setting) == AUTO]
-
-
-def value_of(mapping: Mapping[str, Mapping[str, Any]], setting: str) -> Any:
-    """The value of ``section.key``."""
-    section, key = setting.split(".")
-    return mapping[section][key]
+    """The settings of a complete configuration that are left to a plan, ``section.key``."""
+    return [f"train.{name}" for name in AUTO_SETTINGS if mapping["train"][name] == AUTO]
 
 
 BYTE_UNITS = {"": 1, "b": 1, "kib": 2**10, "mib": 2**20, "gib": 2**30, "kb": 10**3, "mb": 10**6, "gb": 10**9}

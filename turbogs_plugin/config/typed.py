@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import cache
@@ -29,14 +29,13 @@ def settings_of(cls: type) -> dict[str, Field[Any]]:
     return {field.name: field for field in fields(cls) if field.init and field.metadata.get("setting", True)}
 
 
-def build_dataclass(cls: type[T], mapping: Any, where: str, also: Iterable[str] = ()) -> T:
+def build_dataclass(cls: type[T], mapping: Any, where: str) -> T:
     """An instance of dataclass `cls` from a mapping of its settings; those not named keep their defaults.
 
     Args:
         cls: a dataclass with resolvable type hints.
         mapping: plain YAML values; nested dataclasses are nested mappings.
         where: dotted place, for messages.
-        also: keys that the caller has read already, for the hint at an unknown one.
 
     Raises:
         InputError: an unknown key (naming the nearest), a missing one, a wrong type, or a value that the
@@ -51,7 +50,7 @@ def build_dataclass(cls: type[T], mapping: Any, where: str, also: Iterable[str] 
     settings = settings_of(cls)
     for key in mapping:
         if key not in settings:
-            raise InputError(f"unknown key '{where}.{key}': {nearest(key, [*settings, *also])}")
+            raise InputError(f"unknown key '{where}.{key}': {nearest(key, settings)}")
     for name, field in settings.items():
         if name not in mapping and field.default is MISSING and field.default_factory is MISSING:
             raise InputError(f"{where}: key '{name}' is missing")
@@ -62,9 +61,7 @@ def build_dataclass(cls: type[T], mapping: Any, where: str, also: Iterable[str] 
         raise InputError(f"{where}: {error}") from error
 
 
-_type_hints: Callable[[Any], dict[str, Any]] = cache(
-    typing.get_type_hints
-)  # each call evaluates every annotation of the class again
+_type_hints: Callable[[Any], dict[str, Any]] = cache(typing.get_type_hints)  # evaluates every annotation anew
 
 
 def dataclass_mapping(instance: Any) -> dict[str, Any]:
@@ -99,15 +96,14 @@ def convert(value: Any, hint: Any, where: str) -> Any:
         for argument in arguments:
             with suppress(InputError):
                 return convert(value, argument, where)
-    elif origin is list or (origin is tuple and arguments[-1] is Ellipsis):
+    elif origin in (tuple, list):
         if isinstance(value, tuple | list):
             return origin(convert(item, arguments[0], f"{where}[{place}]") for place, item in enumerate(value))
-    elif origin is tuple:
-        if isinstance(value, tuple | list) and len(value) == len(arguments):
-            return tuple(convert(item, kind, where) for item, kind in zip(value, arguments, strict=True))
     elif origin is dict:
         if isinstance(value, Mapping):
-            return {_key(key, where): convert(item, arguments[1], f"{where}.{key}") for key, item in value.items()}
+            return {
+                convert(key, str, where): convert(item, arguments[1], f"{where}.{key}") for key, item in value.items()
+            }
     elif hint is float:
         if number and not math.isnan(value):
             return float(value)
@@ -122,12 +118,6 @@ def convert(value: Any, hint: Any, where: str) -> Any:
     raise InputError(f"{where}: expected {_named(hint)}, got {value!r}")
 
 
-def _key(key: Any, where: str) -> str:
-    if not isinstance(key, str):
-        raise InputError(f"{where}: the name {key!r} is not text: put it in quotes, '{key}'")
-    return key
-
-
 def _named(hint: Any) -> str:
     """What values of a type are called in messages."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
@@ -136,5 +126,5 @@ def _named(hint: Any) -> str:
     if origin is Literal:
         return " or ".join(map(str, arguments))
     if origin in (tuple, list):
-        return "a list, as [A, B]" if Ellipsis in arguments or origin is list else f"a list of {len(arguments)} values"
+        return "a list, as [A, B]"
     return NAMES.get(hint, "a mapping of keys")

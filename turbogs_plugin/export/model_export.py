@@ -60,7 +60,7 @@ def export_run(
     file = out
     if file is None:
         assert model.folder is not None, "only a run is exported without --out"
-        file = model.folder.model.with_suffix(f".{PAGE}" if is_page else FORMATS[file_format].suffix)
+        file = model.folder.model.with_suffix(f".{file_format}")
     if is_page:
         max_gaussians = min(max_gaussians or MOST_ON_PAGE, MOST_ON_PAGE)
     kept, whole = model.gaussians, model.gaussians
@@ -122,9 +122,8 @@ def _require_options(
         raise InputError(f"--max-gaussians {max_gaussians}: it must be at least 1")
     if out is not None:
         require_new_file(out, "--out")
-        ending = PAGE if file_format == PAGE else FORMATS[file_format].suffix.rpartition(".")[2]
-        if out.suffix.lower() != f".{ending}":
-            raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in .{ending}")
+        if out.suffix.lower() != f".{file_format}":
+            raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in .{file_format}")
     elif given is not None:
         raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
     elif max_gaussians is not None and file_format == "ply":

@@ -9,12 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.similarity import in_capture
 from turbogs_plugin.model.torch_file import save_plain
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
+
+BANDS = (0, 3, 8, 15)
+"""Numbers of bands of harmonics above degree 0, of the degrees 0 .. 3."""
 
 
 def save_gsplat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0) -> None:
@@ -62,11 +64,9 @@ def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:
         if value.shape != shape or not value.is_floating_point() or value.layout != torch.strided:
             kind = f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
             raise InputError(f"{path}: {name} is {kind} where gsplat has float32 {shape}: export the model again")
-    if bands not in [(degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)]:
+    if not count or bands not in BANDS:
         raise InputError(
-            f"{path}: shN has {bands} bands: spherical harmonics of degree 0 .. {MAX_SH_DEGREE}, the largest here, "
-            "have 0, 3, 8 or 15: export a model of one of these"
+            f"{path} holds {count} Gaussians whose shN has {bands} bands: export a model with harmonics of degree "
+            "0 .. 3, which has 0, 3, 8 or 15"
         )
-    if not count:
-        raise InputError(f"{path} holds no Gaussians: export the model again")
     return Gaussians(**{name: splats[name].detach().double() for name in PARAMETER_NAMES})

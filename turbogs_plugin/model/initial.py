@@ -9,19 +9,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import mean_neighbor_distances
 from turbogs_plugin.types import SH_C0, Gaussians
 
-INITIAL_OPACITY = 0.1
-"""As in 3DGS."""
 DARKEST = 0.5
 """Smallest channel of a new Gaussian's colour, out of 255: at exactly 0 the clamp of colours may zero its gradient."""
 SMALLEST_SCALE = 1e-4
 """Smallest scale of a new Gaussian, in extents: coincident points would otherwise give a scale of zero."""
-LONELY_SCALE = 0.01
-"""Scale of a Gaussian without neighbours, in extents."""
 BACKDROP_COUNT = 3000
 """Number of Gaussians in the backdrop, 3.7 degrees apart: enough for one colour, and few compared with a capture."""
 BACKDROP_RADIUS = 20.0
@@ -31,7 +26,7 @@ BACKDROP_OPACITY = 0.88
 
 
 def gaussians_from_points(
-    points: Tensor, colors: Tensor, sh_degree: int, extent: float, opacity: float = INITIAL_OPACITY, size: float = 1.0
+    points: Tensor, colors: Tensor, sh_degree: int, extent: float, opacity: float = 0.1, size: float = 1.0
 ) -> Gaussians:
     """One isotropic Gaussian for each point, as 3DGS starts (Kerbl et al. 2023, section 5.1).
 
@@ -47,23 +42,16 @@ def gaussians_from_points(
         size: factor of the scales.
 
     Raises:
-        InputError: no finite points, a degree out of range, or an extent that is not positive.
+        InputError: fewer than two finite points.
     """
-    if not 0 <= sh_degree <= MAX_SH_DEGREE:
-        raise InputError(f"sh_degree is {sh_degree}: it must be 0 .. {MAX_SH_DEGREE}")
-    if not (math.isfinite(extent) and extent > 0):
-        raise InputError(f"extent is {extent}: it must be finite and positive")
     finite = points.isfinite().all(dim=1)
     if not finite.all():
         warnings.warn(f"{int((~finite).sum())} of {len(points)} points are not finite and left out", stacklevel=2)
         points, colors = points[finite], colors[finite]
     count = len(points)
-    if count == 0:
-        raise InputError("there are no points to start from")
-    distances = (
-        mean_neighbor_distances(points, neighbors=3) if count > 1 else points.new_full((1,), LONELY_SCALE * extent)
-    )
-    scales = (size * distances).clamp(min=SMALLEST_SCALE * extent).log()
+    if count < 2:
+        raise InputError(f"there are too few points to start from: {count}")
+    scales = (size * mean_neighbor_distances(points, neighbors=3)).clamp(min=SMALLEST_SCALE * extent).log()
     quats = points.new_zeros(count, 4)
     quats[:, 0] = 1.0
     return Gaussians(

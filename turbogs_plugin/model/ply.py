@@ -8,13 +8,12 @@ from typing import BinaryIO
 import numpy as np
 import torch
 
-from turbogs_plugin.engine.layout import MAX_SH_DEGREE
 from turbogs_plugin.errors import InputError, refusal
 from turbogs_plugin.files import write_atomically
-from turbogs_plugin.model.packed import read_compressed_ply
+from turbogs_plugin.model.gsplat_file import BANDS
 from turbogs_plugin.model.similarity import Similarity, in_capture, placed, rounding
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.ply import read_header, read_vertices
+from turbogs_plugin.scene.ply import read_vertices
 from turbogs_plugin.types import Gaussians
 
 POSITION_ERROR = 1e-6
@@ -80,22 +79,17 @@ def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
 def read_ply(path: str | Path) -> Gaussians:
     """`load_ply` in the file's own coordinates and in float64; rows may be not finite."""
     path = Path(path)
-    if any(line.startswith("element chunk") for line in read_header(path)[0]):
-        return read_compressed_ply(path)
     vertices = read_vertices(path)
     rest = sum(name.startswith("f_rest_") for name in vertices)
-    bands = {3 * ((degree + 1) ** 2 - 1): (degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)}
-    if rest not in bands:
-        raise InputError(
-            f"{path} has {rest} properties f_rest_*: spherical harmonics of degree 0 .. {MAX_SH_DEGREE}, the "
-            f"largest here, have one of {sorted(bands)}"
-        )
-    groups = _property_groups(bands[rest])
+    bands = rest // 3
+    if rest not in [3 * each for each in BANDS]:
+        raise InputError(f"{path} has {rest} properties f_rest_*: harmonics of degree 0 .. 3 have 0, 9, 24 or 45")
+    groups = _property_groups(bands)
     del groups["normals"]  # not part of a model
     if missing := [name for group in groups.values() for name in group if name not in vertices]:
         raise InputError(
-            f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}, as a mesh or a "
-            "cloud of points does: give the .ply that a 3DGS trainer exports"
+            f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}, as a mesh, a "
+            "cloud of points or a compressed .ply does: give the .ply that a 3DGS trainer exports"
         )
     count = len(vertices["x"])
     if not count:
@@ -106,7 +100,7 @@ def read_ply(path: str | Path) -> Gaussians:
             values[parameter][:, place] = torch.from_numpy(vertices[name].astype(np.float64))
     values["opacities"] = values["opacities"][:, 0]
     values["sh0"] = values["sh0"][:, None]
-    values["shN"] = values["shN"].view(count, 3, bands[rest]).transpose(1, 2).contiguous()
+    values["shN"] = values["shN"].view(count, 3, bands).transpose(1, 2).contiguous()
     return Gaussians(**values)
 
 

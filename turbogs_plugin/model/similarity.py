@@ -131,14 +131,9 @@ def _finite(gaussians: Gaussians, owner: str = "") -> Gaussians:
 
 def _product(left: Tensor, right: Tensor) -> Tensor:
     """[N, 4] Hamilton products of one quaternion [4] with others [N, 4], wxyz."""
-    w, x, y, z = left.unbind()
-    matrix = torch.stack([
-        w, -x, -y, -z,
-        x, w, -z, y,
-        y, z, w, -x,
-        z, -y, x, w,
-    ])  # fmt: skip
-    return right @ matrix.view(4, 4).T
+    (w, v), (real, imaginary) = (left[0], left[1:]), (right[:, :1], right[:, 1:])
+    turned = w * imaginary + real * v + torch.linalg.cross(v.expand_as(imaginary), imaginary)
+    return torch.cat([w * real - imaginary @ v[:, None], turned], dim=1)
 
 
 def _turned_harmonics(shN: Tensor, rotation: np.ndarray) -> Tensor:

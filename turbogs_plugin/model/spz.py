@@ -20,7 +20,6 @@ import torch
 from turbogs_plugin.engine.reference.spherical_harmonics import basis
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
-from turbogs_plugin.model.packed import unpacked_model, unpacked_rotations
 from turbogs_plugin.model.similarity import in_capture
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import too_large
@@ -100,14 +99,16 @@ def read_spz(path: Path) -> Gaussians:
     words = np.ascontiguousarray(rotations).view("<u4")[:, 0]
     wide = np.zeros((count, 3, 4), dtype=np.uint8)
     wide[:, :, 1:] = means.reshape(count, 3, 3)  # in the upper bytes, so that the sign is theirs
-    return unpacked_model(
-        means=(wide.view("<i4")[:, :, 0] >> 8) / 2.0**bits * [1.0, -1.0, -1.0],
-        quats=(unpacked_rotations(words, _component) * [1.0, -1.0, -1.0, 1.0])[:, [3, 0, 1, 2]],
-        scales=scales / 16.0 - 10.0,
-        shares=opacities[:, 0] / 255.0,
-        sh0=(colors / 255.0 - 0.5) / COLOR_SCALE,
-        shN=(harmonics.reshape(count, bands, 3) - 128.0) / SH_SCALE * _flips(degree)[:, None],
-    )
+    shares = (opacities[:, 0] / 255.0).clip(1e-4, 1.0 - 1e-4)
+    values = {
+        "means": (wide.view("<i4")[:, :, 0] >> 8) / 2.0**bits * [1.0, -1.0, -1.0],
+        "quats": (_unpacked_rotations(words) * [1.0, -1.0, -1.0, 1.0])[:, [3, 0, 1, 2]],
+        "scales": scales / 16.0 - 10.0,
+        "opacities": np.log(shares / (1.0 - shares)),
+        "sh0": ((colors / 255.0 - 0.5) / COLOR_SCALE)[:, None],
+        "shN": (harmonics.reshape(count, bands, 3) - 128.0) / SH_SCALE * _flips(degree)[:, None],
+    }
+    return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in values.items()})
 
 
 def _flips(degree: int) -> np.ndarray:
@@ -118,7 +119,8 @@ def _flips(degree: int) -> np.ndarray:
 
 
 def _packed_rotations(quats: np.ndarray) -> np.ndarray:
-    """[N] uint32 of [N, 4] quaternions of any norm, xyzw, as `unpacked_rotations` takes them with `_component`."""
+    """[N] uint32 of [N, 4] quaternions of any norm, xyzw: the place of the largest component in 2 bits, then the others
+    in their order, a sign and 9 bits each."""
     unit = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
     largest = np.abs(unit).argmax(axis=1)
     unit = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -unit, unit)
@@ -130,10 +132,17 @@ def _packed_rotations(quats: np.ndarray) -> np.ndarray:
     return words.astype("<u4")
 
 
-def _component(codes: np.ndarray) -> np.ndarray:
-    """Components of a unit quaternion, of a sign and a size."""
-    size = (codes & LARGEST_COMPONENT) / (LARGEST_COMPONENT * math.sqrt(2.0))
-    return np.where(codes > LARGEST_COMPONENT, -size, size)
+def _unpacked_rotations(words: np.ndarray) -> np.ndarray:
+    """[N, 4] unit quaternions, xyzw, of what `_packed_rotations` gives."""
+    largest = words >> 30
+    found = np.zeros((len(words), 4))
+    for place in (3, 2, 1, 0):
+        stored, size = largest != place, (words & LARGEST_COMPONENT) / (LARGEST_COMPONENT * math.sqrt(2.0))
+        found[:, place] = np.where(stored, np.where(words & (LARGEST_COMPONENT + 1), -size, size), 0.0)
+        words = np.where(stored, words >> 10, words)
+    rest = np.sqrt(np.maximum(0.0, 1.0 - np.square(found).sum(axis=1)))
+    np.put_along_axis(found, largest[:, None].astype(np.int64), rest[:, None], axis=1)
+    return found
 
 
 def _bytes(values: np.ndarray) -> bytes:

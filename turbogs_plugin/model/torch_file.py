@@ -16,27 +16,12 @@ from turbogs_plugin.files import write_atomically
 from turbogs_plugin.scene.host_arrays import too_large
 
 
-def load_plain(path: Path) -> Any:
+def read_plain(path: Path, name: str, remedy: str = "") -> Any:
     """What a file of `torch.save` holds, on the CPU.
 
     Only plain tensors and values are read (``weights_only``). They must be uncompressed and no larger than the file. So
     a file from an untrusted source can neither run code nor fill the memory. One that is large beside the free memory
     stays on the disk, from where tensors are read as they are used; its checksums are not looked at.
-
-    Raises:
-        OSError: the file cannot be read.
-        Exception: anything else wrong with it; torch and zipfile raise a dozen kinds for malformed files.
-    """
-    _require_bounded(path)
-    state = torch.load(path, map_location="cpu", weights_only=True, mmap=too_large(os.path.getsize(path)))
-    tensors = [value for _, value in leaves(state, "state") if isinstance(value, Tensor)]
-    if any(tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes() for tensor in tensors):
-        raise ValueError("it has a tensor that is not stored whole")
-    return state
-
-
-def read_plain(path: Path, name: str, remedy: str = "") -> Any:
-    """`load_plain`, where the user named the file.
 
     Args:
         name: of the file, for messages.
@@ -46,10 +31,15 @@ def read_plain(path: Path, name: str, remedy: str = "") -> Any:
         InputError: the file cannot be read, or used.
     """
     try:
-        return load_plain(path)
+        _require_bounded(path)
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=too_large(os.path.getsize(path)))
+        tensors = [value for _, value in leaves(state, "state") if isinstance(value, Tensor)]
+        if any(tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes() for tensor in tensors):
+            raise ValueError("it has a tensor that is not stored whole")
+        return state
     except OSError as error:
         raise InputError(f"cannot read {name}: {error.strerror or error}") from None
-    except Exception as error:
+    except Exception as error:  # torch and zipfile raise a dozen kinds for malformed files
         if isinstance(error, zipfile.BadZipFile):
             reason = "it is not a whole file of torch.save"
         elif "weights only" in str(error).lower().replace("_", " "):

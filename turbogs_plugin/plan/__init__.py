@@ -3,8 +3,7 @@
 Beside it the limits of a run: the cap on Gaussians, and memory.
 """
 
-from turbogs_plugin.plan.decisions import Decision
+from turbogs_plugin.plan.decisions import Decision, Plan, make_plan
 from turbogs_plugin.plan.facts import SceneFacts, gather_facts
-from turbogs_plugin.plan.plan import Plan, make_plan
 
 __all__ = ["Decision", "Plan", "SceneFacts", "gather_facts", "make_plan"]

@@ -1,4 +1,5 @@
-"""One pure function a setting that may be ``auto``: facts and configuration -> what the setting should be, and why.
+"""The plan of a run: one pure function a setting that may be ``auto``, facts and configuration -> what the setting
+should be, and why; and the configuration that follows.
 
 Every criterion compares a number of the facts with a constant of this module, whose docstring says where it is from.
 """
@@ -9,14 +10,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
+
 from turbogs_plugin.config.configuration import Config
-from turbogs_plugin.config.scaling import RATE_EXPONENT
-from turbogs_plugin.config.sections import AUTO, WRITTEN_FOR, value_of
+from turbogs_plugin.config.scaling import RATE_EXPONENT, with_batch_for, with_iterations
+from turbogs_plugin.config.sections import AUTO, WRITTEN_FOR
 from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.model.initial import BACKDROP_COUNT
-from turbogs_plugin.plan.caps import cap_of
-from turbogs_plugin.plan.facts import SceneFacts
-from turbogs_plugin.plan.memory import images_per_iteration
+from turbogs_plugin.plan.facts import SceneFacts, gather_facts
+from turbogs_plugin.plan.memory import cap_of, images_per_iteration
+from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.host_arrays import MEMORY_SHARE as HOST_SHARE
 
 ONE_SIDED = 0.95
@@ -47,8 +50,6 @@ SHORTEST_SHARE = 0.4
 Several processes, whose steps are longer by the root of their number, need fewer by that root."""
 
 Value = bool | int | float | str
-
-
 Verdict = tuple[Value, str]
 """A setting's value by the facts, and the reason, with the number that decides."""
 
@@ -69,15 +70,10 @@ class Decision:
     made: str
     reason: str
 
-    @property
-    def text(self) -> str:
-        """The value as YAML has it."""
-        return yaml_text(self.value)
-
 
 def decide(setting: str, facts: SceneFacts, config: Config) -> Decision:
     """A setting's value in a run: by the configuration or, where that is ``auto``, by the facts."""
-    present, (value, reason) = value_of(config.to_mapping(), setting), RULES[setting](facts, config)
+    present, (value, reason) = getattr(config.train, setting.removeprefix("train.")), RULES[setting](facts, config)
     if present == AUTO:
         return Decision(setting, value, "auto", reason)
     return Decision(setting, present, "set", f"auto: {yaml_text(value)}, {reason}")
@@ -113,7 +109,7 @@ def wanted_exposure(facts: SceneFacts, config: Config) -> Verdict:
     if facts.exposure_views is None:
         return False, "unless the photos' exposures say otherwise, which only auto compares"
     if 2 * facts.exposure_views < facts.train_views:
-        return (False, f"only {facts.exposure_views} of {facts.train_views} photos could be compared")
+        return False, f"only {facts.exposure_views} of {facts.train_views} photos could be compared"
     spread, rest = facts.exposure_spread, facts.exposure_rest
     differ, told = spread >= EXPOSURE_STOPS, rest <= EXPOSURE_SHARE * spread
     reason = f"photos {spread:.2f} stops apart {_sign(differ)} {EXPOSURE_STOPS}"
@@ -141,11 +137,9 @@ def wanted_batch_for(facts: SceneFacts, config: Config) -> tuple[int, str]:
         return 1, "one process" if count == 1 else "the schedule has no number of views"
     wanted = min(count, LARGEST_BATCH)
     fitting = max(1, min(wanted, min(views, MAX_VIEWS) // most))
-    reason = f"{count} processes" + (f", of which a batch for {wanted} costs no error" if wanted < count else "")
     if fitting < wanted:
-        bound = f"an iteration's {MAX_VIEWS}" if views > MAX_VIEWS else f"{views} training views"
-        reason += f", but {fitting + 1} times {most} views > {bound}"
-    return fitting, reason
+        return fitting, f"{count} processes, but {fitting + 1} times {most} views > {min(views, MAX_VIEWS)}"
+    return fitting, f"{count} processes; a batch for {LARGEST_BATCH} costs no error"
 
 
 def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
@@ -167,35 +161,19 @@ def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
     return math.ceil(given / 100) * 100, reason
 
 
-def wanted_maps_place(facts: SceneFacts, config: Config) -> Verdict:
-    """Maps on the device, unless they do not fit even without the photos.
-
-    Photos are the first to go: of a pixel, 3 bytes travel in, of the maps 4 in and 4 out.
-    """
-    room = HOST_SHARE * facts.host_free_bytes
-    in_file = f"> {HOST_SHARE:.0%} of {mebibytes(facts.host_free_bytes)} free on the host: in a file"
-    if facts.device == "cpu" and facts.map_bytes > room:
-        return "host", f"{mebibytes(facts.map_bytes)} {in_file}"
-    photos = facts.photo_bytes if config.train.photos_place == "device" else 0
-    place, reason = _place(facts, facts.map_bytes, photos, "photos")
-    return place, f"{reason}, {in_file}" if place == "host" and facts.map_bytes > room else reason
-
-
-def wanted_photos_place(facts: SceneFacts, config: Config) -> Verdict:
-    """Photos on the device, where they fit beside the maps that are there."""
-    maps = facts.map_bytes if decide("train.maps_place", facts, config).value == "device" else 0
-    return _place(facts, facts.photo_bytes, maps, "maps")
-
-
-def _place(facts: SceneFacts, size: int, others: int, name_of_others: str) -> Verdict:
+def wanted_pixels_place(facts: SceneFacts, config: Config) -> Verdict:
+    """Photos and maps on the device where they fit into a share of its memory; of a pixel, 3 bytes of photos and 4 of
+    maps travel to the device each iteration otherwise, and 4 back."""
+    room = HOST_SHARE * facts.host_bytes
+    in_file = f"{HOST_SHARE:.0%} of {mebibytes(facts.host_bytes)} free on the host: maps in a file"
     if facts.device == "cpu":
+        if facts.map_bytes > room:
+            return "host", f"{mebibytes(facts.map_bytes)} > {in_file}"
         return "device", "the device is the CPU, whose memory is the host's"
-    limit = facts.device_free_bytes if facts.memory_limit is None else min(facts.device_free_bytes, facts.memory_limit)
-    fits = size + others <= DEVICE_SHARE * limit
-    beside = f" beside {mebibytes(others)} of {name_of_others}" if others else ""
-    which = "free" if limit == facts.device_free_bytes else "allowed"
-    reason = f"{mebibytes(size)}{beside} {'<=' if fits else '>'} {DEVICE_SHARE:.0%} of {mebibytes(limit)} {which}"
-    return "device" if fits else "host", reason
+    size = facts.photo_bytes + facts.map_bytes
+    fits = size <= DEVICE_SHARE * facts.device_bytes
+    reason = f"{mebibytes(size)} {'<=' if fits else '>'} {DEVICE_SHARE:.0%} of {mebibytes(facts.device_bytes)}"
+    return "device" if fits else "host", f"{reason}, > {in_file}" if not fits and facts.map_bytes > room else reason
 
 
 def mebibytes(size: int) -> str:
@@ -214,7 +192,53 @@ RULES: dict[str, Callable[[SceneFacts, Config], Verdict]] = {
     "train.dropout": wanted_dropout,
     "train.batch_for": wanted_batch_for,
     "train.iterations": wanted_iterations,
-    "train.maps_place": wanted_maps_place,
-    "train.photos_place": wanted_photos_place,
+    "train.pixels_place": wanted_pixels_place,
 }
 """Setting that may be ``auto`` (`AUTO_SETTINGS`) -> its rule."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Facts and decisions, in the order in which they are printed."""
+
+    facts: SceneFacts
+    decisions: tuple[Decision, ...]
+
+    def apply(self, config: Config) -> Config:
+        """The configuration with everything decided: a plan of it changes nothing."""
+        made = {decision.setting: decision.value for decision in self.decisions if decision.made == "auto"}
+        if (batch := made.pop("train.batch_for", None)) is not None:
+            config = with_batch_for(config, int(batch))
+        if (iterations := made.pop("train.iterations", None)) is not None:
+            config = with_iterations(config, int(iterations))
+        return config.changed(train={name.removeprefix("train."): value for name, value in made.items()})
+
+    def text(self) -> str:
+        """For a terminal, and ``plan.txt`` of a run: a line a decision."""
+        name = max(len(decision.setting) for decision in self.decisions)
+        value = max(len(yaml_text(decision.value)) for decision in self.decisions)
+        lines = [
+            f"  {decision.setting:<{name}} {yaml_text(decision.value):<{value}}  {decision.made:<4}  {decision.reason}"
+            for decision in self.decisions
+        ]
+        return "\n".join([f"plan for {self.facts.train_views} training views", *lines])
+
+
+def make_plan(config: Config, scene: Scene, device: torch.device, processes: int = 1) -> Plan:
+    """Look at scene and machine, and decide what the configuration leaves to decide, within its budgets.
+
+    Args:
+        config: what is ``auto`` in it is decided.
+        scene: loaded.
+        device: where training is to be.
+        processes: that will train one model together.
+    """
+    asked = config.train.exposure == AUTO
+    limit = config.budget.memory_bytes()
+    facts = gather_facts(scene, device, memory_limit=limit, processes=processes, with_exposures=asked)
+    return plan_from_facts(facts, config)
+
+
+def plan_from_facts(facts: SceneFacts, config: Config) -> Plan:
+    """The plan that these facts lead to."""
+    return Plan(facts, tuple(decide(setting, facts, config) for setting in RULES))

@@ -24,8 +24,8 @@ class SceneFacts:
         photo_bytes: of all photos, training and test.
         map_bytes: of the training views' error and age maps.
         device: cpu or cuda.
-        device_free_bytes, host_free_bytes: memory free for this run; on a CPU both are the same memory.
-        memory_limit: bytes of the device that the run was told not to exceed, or None.
+        device_bytes, host_bytes: memory free for this run, on the device at most `budget.max_memory`; on a CPU both are
+            the same memory.
         transparent: training photos have an alpha.
         processes: that will train one model together.
         exposure_spread, exposure_rest, exposure_views: how far photos differ in brightness and white balance, in stops
@@ -39,9 +39,8 @@ class SceneFacts:
     photo_bytes: int
     map_bytes: int
     device: str
-    device_free_bytes: int
-    host_free_bytes: int
-    memory_limit: int | None = None
+    device_bytes: int
+    host_bytes: int
     transparent: bool = False
     processes: int = 1
     exposure_spread: float = 0.0
@@ -62,7 +61,7 @@ def gather_facts(
     """The facts of a scene, to be trained on a device.
 
     Args:
-        scene: on any device; photos that are already on `device` count as free memory, for they are planned here.
+        scene: in host memory.
         device: where training is to be.
         memory_limit: bytes of the device that must not be exceeded.
         processes: that will train together.
@@ -72,15 +71,18 @@ def gather_facts(
     pixels, test_pixels = (int(part.cameras.sizes.prod(axis=1).sum()) for part in (scene.train, scene.test))
     gains = compare_exposures(views, scene.points) if with_exposures else None
     host_free = free_host_bytes()
+    free = host_free
+    if device.type == "cuda":
+        free = torch.cuda.mem_get_info(device)[0]
+        free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     return SceneFacts(
         train_views=len(views),
         direction_concentration=float(views.cameras.directions.double().mean(dim=0).norm()),
         photo_bytes=(PHOTO_BYTES + views.photos.transparent) * (pixels + test_pixels),
         map_bytes=MAP_BYTES * pixels,
         device=device.type,
-        device_free_bytes=_free_device_bytes(device, scene) if device.type == "cuda" else host_free,
-        host_free_bytes=host_free,
-        memory_limit=memory_limit,
+        device_bytes=min(free, free if memory_limit is None else memory_limit),
+        host_bytes=host_free,
         transparent=views.photos.transparent,
         processes=processes,
         exposure_spread=gains.spread if gains else 0.0,
@@ -88,10 +90,3 @@ def gather_facts(
         exposure_views=int(gains.compared.sum()) if gains else None,
         reprojection_error=scene.reprojection_error,
     )
-
-
-def _free_device_bytes(device: torch.device, scene: Scene) -> int:
-    free, _ = torch.cuda.mem_get_info(device)
-    free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    ours = (views.photos.stored for views in (scene.train, scene.test))
-    return free + sum(colors.numel() for colors in ours if colors.device.type == "cuda")

@@ -1,4 +1,5 @@
-"""Device memory of a run, and the cap on Gaussians that keeps a limit of it.
+"""The cap on Gaussians, which is the `max_gaussians` of the density control and nowhere else; and the device memory of
+a run, with the cap that keeps a limit of it.
 
 The peak of a run on a GPU is taken to be ``fixed + per_gaussian * N``, all of it torch's own allocations (the CUDA
 context comes on top, with its 0.3 to 0.6 GiB). With K views an iteration, degree-d harmonics (B bands above 0) and
@@ -22,12 +23,14 @@ import torch
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.error_maps import MAP_BYTES
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.plan.caps import FEWEST_GAUSSIANS, cap_of, growth_room, with_cap
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import SETS
 from turbogs_plugin.scene.photos import PHOTO_BYTES
 from turbogs_plugin.tiles import TILE_PIXELS
+from turbogs_plugin.types import Step
 
+FEWEST_GAUSSIANS = 1000
+"""Smallest number of Gaussians that can be a model of a capture."""
 VIEW_BYTES = 230
 """Bytes of a Gaussian in a view: the rasterizer's instance, radius and gradient record, and its share of the
 intersections. Measured on an H200: 213 between 150 and 600 thousand Gaussians."""
@@ -37,6 +40,23 @@ IMAGE_BYTES = 120
 """Bytes of a pixel of a whole render."""
 WHOLE_VIEWS = ("dense",)
 """Pixel samplers that take every pixel of a view, whatever lambda."""
+
+
+def cap_of(config: Config) -> int:
+    """Most Gaussians of the finished model; 0: no cap."""
+    return config.density.get("max_gaussians", 0)
+
+
+def with_cap(config: Config, cap: int) -> Config:
+    """The configuration with this cap.
+
+    Raises:
+        InputError: its density control keeps no cap.
+    """
+    if "max_gaussians" not in config.density:
+        kind = config.density["type"]
+        raise InputError(f"density.type {kind} keeps no cap on Gaussians: use one of error_driven, mcmc, none")
+    return config.changed(density={"max_gaussians": cap})
 
 
 def most_views(config: Config, num_views: int) -> int:
@@ -85,8 +105,9 @@ class MemoryDemand:
         num_views = len(train)
         views = most_views(config, num_views)
         window = SETS * views * largest
-        photos = window + SETS * largest if config.train.photos_place == "host" else pixels + test_pixels
-        maps = window if config.train.maps_place == "host" else pixels
+        photos, maps = pixels + test_pixels, pixels
+        if config.train.pixels_place == "host":
+            photos, maps = window + SETS * largest, window
         samples = math.ceil(most_images(config, num_views) * largest)
         numbers = 14 + 3 * ((config.train.sh_degree + 1) ** 2 - 1)
         return cls(
@@ -111,12 +132,6 @@ class MemoryDemand:
         return count
 
 
-def require_gpu_memory(device: torch.device) -> None:
-    """Raise `InputError` where the memory of a device that is no GPU is to be limited."""
-    if device.type != "cuda":
-        raise InputError("--max-memory limits the memory of a GPU, and this run would be on a CPU: leave it out")
-
-
 def hold_to_limit(config: Config, device: torch.device) -> None:
     """Hold torch to the configuration's limit of device memory, if it has one, for the rest of the process.
 
@@ -125,7 +140,8 @@ def hold_to_limit(config: Config, device: torch.device) -> None:
     """
     limit = config.budget.memory_bytes()
     if limit is not None:
-        require_gpu_memory(device)
+        if device.type != "cuda":
+            raise InputError("--max-memory limits the memory of a GPU, and this run would be on a CPU: leave it out")
         total = torch.cuda.get_device_properties(device).total_memory
         torch.cuda.set_per_process_memory_fraction(min(1.0, limit / total))
 
@@ -144,5 +160,7 @@ def within_memory(config: Config, scene: Scene) -> Config:
         return config
     sizes = (scene.train.cameras.sizes, scene.test.cameras.sizes)
     demand = MemoryDemand.of(config, *sizes, photo_bytes=scene.train.photos.stored.shape[1])
-    fitting = max(1, int(demand.gaussians(limit) / growth_room(config)))
+    train = config.train
+    growth = config.build("density").growth_room(Step(0, train.written_iterations, train.refine_until))
+    fitting = max(1, int(demand.gaussians(limit) / growth))
     return with_cap(config, min(fitting, cap_of(config) or fitting))

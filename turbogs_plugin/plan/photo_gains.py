@@ -42,7 +42,6 @@ PATCHES_OF_A_PHOTO, PATCHES_AT_MOST = 400, 200_000
 LUMINANCE = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 ROUNDS, SMALLEST_RESIDUAL = 10, 0.01
 """Rounds of reweighted least squares, and the residual in stops below which all pairs weigh the same."""
-SOLVER_STEPS, SOLVED = 1000, 1e-6
 
 Floats = NDArray[np.floating]
 Integers = NDArray[np.integer]
@@ -54,24 +53,16 @@ class PhotoGains:
 
     Args:
         gains: [V, 3] float64 of the channels; their mean over what is compared is 0.
-        left: [V, 3] float64, the gains less what the photos before and after tell (`turbogs_plugin.scene.sequence`).
         compared: [V] bool, photos that share enough with another one; the others' gains are 0.
+        spread: standard deviation of the gains of what is compared.
+        rest: standard deviation of these from the gains of the photos before and after (`scene.sequence`). A camera's
+            automatic that follows the light leaves little; exposures at random leave more than there was.
     """
 
     gains: Floats
-    left: Floats
     compared: NDArray[np.bool_]
-
-    @property
-    def spread(self) -> float:
-        """Standard deviation of the gains."""
-        return _deviation(self.gains[self.compared])
-
-    @property
-    def rest(self) -> float:
-        """Standard deviation of the gains from the gains of the photos before and after. A camera's automatic that
-        follows the light leaves little; exposures at random leave more than there was."""
-        return _deviation(self.left[self.compared])
+    spread: float
+    rest: float
 
 
 @dataclass(frozen=True)
@@ -120,10 +111,9 @@ def compare_exposures(views: PosedImages, points: Tensor) -> PhotoGains:
     gains = fit_gains(pairs, np.array(list(kept.values()), dtype=np.float64).reshape(-1, 3), weights, count)
     compared = np.bincount(pairs.reshape(-1), minlength=count) > 0  # [V]
     names = [name for name, told in zip(views.names, compared, strict=True) if told]
-    left = gains.copy()
-    near = PhotoOrder(views.names).neighbours(names, names)
-    left[compared] -= near.mean(torch.from_numpy(gains[compared])).numpy()
-    return PhotoGains(gains, left, compared)
+    among, near = gains[compared], PhotoOrder(views.names).neighbours(names, names)
+    rest = among - near.mean(torch.from_numpy(among)).numpy()
+    return PhotoGains(gains, compared, _deviation(among), _deviation(rest))
 
 
 def fit_gains(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> Floats:
@@ -137,57 +127,30 @@ def fit_gains(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> F
         weights: [E] > 0.
         count: V.
     """
+    from scipy.sparse import csr_matrix, diags
+    from scipy.sparse.linalg import lsqr
+
+    signs, rows = np.tile([1.0, -1.0], len(pairs)), np.repeat(np.arange(len(pairs)), 2)
+    differences = csr_matrix((signs, (rows, pairs.reshape(-1))), shape=(len(pairs), count))
     gains: Floats = np.zeros((count, 3))
     for _ in range(ROUNDS if len(pairs) else 0):
-        residuals = gains[pairs[:, 0]] - gains[pairs[:, 1]] - ratios
-        present = weights / np.maximum(SMALLEST_RESIDUAL, np.linalg.norm(residuals, axis=1))
-        gains = _least_squares(pairs, ratios, present, count)
+        residuals = np.linalg.norm(differences @ gains - ratios, axis=1)
+        roots = np.sqrt(weights / np.maximum(SMALLEST_RESIDUAL, residuals))  # [E]
+        weighted = diags(roots) @ differences
+        # Of all solutions the smallest, whose means are 0.
+        gains = np.stack([lsqr(weighted, roots * ratios[:, channel])[0] for channel in range(3)], axis=1)
     return gains
-
-
-def _least_squares(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> Floats:
-    """[V, 3] solution of the normal equations, a graph's Laplacian, by conjugate gradients: from 0 on, means stay 0."""
-
-    def towards(differences: Floats) -> Floats:
-        weighted = weights[:, None] * differences
-        return _summed(pairs, np.stack([weighted, -weighted], axis=1), count)
-
-    solution = np.zeros((count, 3))
-    residual = towards(ratios)
-    direction, size = residual, (residual**2).sum(axis=0)  # [V, 3], [3]
-    enough = SOLVED**2 * ((weights[:, None] * ratios) ** 2).sum(axis=0)
-    for _ in range(SOLVER_STEPS):
-        active = size > enough  # a channel that is solved stays as it is
-        if not active.any():
-            break
-        image = towards(direction[pairs[:, 0]] - direction[pairs[:, 1]])
-        step = np.divide(size, (direction * image).sum(axis=0), out=np.zeros(3), where=active)
-        solution, residual = solution + step * direction, residual - step * image
-        before, size = size, (residual**2).sum(axis=0)
-        direction = residual + np.divide(size, before, out=np.zeros(3), where=active) * direction
-    return solution
-
-
-def _summed(pairs: Integers, values: Floats, count: int) -> Floats:
-    """[V, 3] sums of [E, 2, 3] values over the places that [E, 2] pairs name."""
-    flat, rows = pairs.reshape(-1), values.reshape(-1, 3)
-    return np.stack([np.bincount(flat, rows[:, channel], minlength=count) for channel in range(3)], axis=1)
 
 
 def _compare(first: _Patches, second: _Patches) -> tuple[Floats, int]:
     """[3] median of first over second, in stops, and the number of patches behind it; 0 where these are too few."""
     _, here, there = np.intersect1d(first.points, second.points, assume_unique=True, return_indices=True)
-    ours, others = first.shapes[here], second.shapes[there]
-    alike = _alike(ours, others)
-    by_chance = _alike(ours, np.roll(others, len(others) // 2, axis=0))  # of different points
+    ours, others = first.shapes[here], second.shapes[there]  # [n, 25]
+    others_of = np.roll(others, len(others) // 2, axis=0)  # of different points
+    alike, by_chance = ((ours * each).sum(axis=1) >= LIKENESS for each in (others, others_of))  # [n]
     if alike.sum() < max(FEWEST_MATCHES, TIMES_CHANCE * by_chance.sum()):
         return np.zeros(3), 0
     return np.median(first.stops[here[alike]] - second.stops[there[alike]], axis=0), int(alike.sum())
-
-
-def _alike(first: Floats, second: Floats) -> NDArray[np.bool_]:
-    """[n] whether two shapes [n, 25] show the same."""
-    return (first * second).sum(axis=1) >= LIKENESS
 
 
 def _sight(views: PosedImages, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import replace
 from pathlib import Path
+
+import torch
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.report.tables import views_table
@@ -11,9 +14,11 @@ from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.inputs import resolve_device
 from turbogs_plugin.train.look import Look, interpolated_exposures
-from turbogs_plugin.train.metrics import evaluate
-from turbogs_plugin.train.perceptual import load_flip, load_lpips
+from turbogs_plugin.train.metrics import ImageError, evaluate
 from turbogs_plugin.train.saved_model import SavedModel, load_with_capture
+
+LPIPS_PACKAGES = ("torchvision", "torchmetrics")
+"""Packages with the network, and with LPIPS itself."""
 
 
 def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> str:
@@ -26,12 +31,10 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
     """
     model, scene = open_saved(path, device_name, given)
     views, look = views_of(model, scene, "test")
-    views = place_views(views, model.gaussians.device, model.config.train.photos_place)
+    views = place_views(views, model.gaussians.device, model.config.train.pixels_place)
     lpips, reason = load_lpips(model.gaussians.device)
-    flip, no_flip = load_flip()
-    metrics = evaluate(model.gaussians, views, look, lpips, flip, aligned=True, refined=True)
+    metrics = evaluate(model.gaussians, views, look, lpips, refined=True)
     note = f"\nLPIPS was not computed: {reason}" if reason else ""
-    note += f"\nFLIP was not computed: {no_flip}" if no_flip else ""
     which = f"iteration {model.iteration}" if given is None else str(path)
     speed = f"{len(model.gaussians)} Gaussians, {metrics.fps:.1f} views a second"
     return f"{views_table(metrics, with_means=True)}\n\n{which}, {speed}{note}"
@@ -56,3 +59,26 @@ def views_of(model: SavedModel, scene: Scene, split: str) -> tuple[PosedImages, 
     if exposures is not None and split == "test":
         exposures = interpolated_exposures(exposures, scene.train.names, scene.test.names)
     return views, replace(model.own_look(views), exposures=exposures)
+
+
+def load_lpips(device: torch.device) -> tuple[ImageError | None, str]:
+    """LPIPS (VGG16) by torchmetrics, if `LPIPS_PACKAGES` are installed and the backbone's weights are in torch's cache.
+    Nothing is downloaded, and what takes seconds to import is imported here.
+
+    Args:
+        device: where to compute.
+
+    Returns:
+        The function, or None; and the reason for None.
+    """
+    missing = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        release = torch.__version__.partition("+")[0]  # or pip may bring another torch with torchvision
+        return None, f"it needs {' and '.join(missing)}: pip install {' '.join(missing)} torch=={release}"
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / "vgg16-397923af.pth"  # torchvision's name
+    if not weights.is_file():
+        return None, f"there are no weights of VGG16 on this machine: put torchvision's file at {weights}"
+    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+    network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to(device)
+    return lambda image, photo: network(image.permute(2, 0, 1)[None], photo.permute(2, 0, 1)[None]).item(), ""

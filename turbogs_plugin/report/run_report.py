@@ -7,13 +7,12 @@ import shlex
 from pathlib import Path
 
 from turbogs_plugin.config.sections import STRIPS
-from turbogs_plugin.files import write_text_atomically
-from turbogs_plugin.plan import Plan
+from turbogs_plugin.files import read_text, write_text_atomically
+from turbogs_plugin.report.evaluation import load_lpips
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip
 from turbogs_plugin.report.provenance import hardware, software
 from turbogs_plugin.report.tables import ERRORS, error_columns, errors, history_rows, table, views_table
 from turbogs_plugin.train.metrics import Metrics, evaluate, render_view
-from turbogs_plugin.train.perceptual import load_lpips
 from turbogs_plugin.train.session import RunSession
 
 
@@ -26,10 +25,9 @@ def write_report(run: RunSession) -> Path:
     trainer = run.trainer
     look = trainer.look(run.test.names)
     lpips, lpips_reason = load_lpips(trainer.device)
-    metrics = None if lpips else run.evaluations.metrics_at(trainer.iteration)
+    metrics = None if lpips else run.evaluations.metrics  # of the end
     if metrics is None:
-        aligned = trainer.exposures is not None
-        metrics = evaluate(trainer.gaussians, run.test, look, lpips, aligned=aligned, refined=True)
+        metrics = evaluate(trainer.gaussians, run.test, look, lpips, refined=True)
     run.clock.mark("report")
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
@@ -63,7 +61,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
         lpips_reason: why LPIPS was not computed; empty where it was.
         shown: test views with a picture.
     """
-    last = run.history[-1]
+    last, plan = run.history[-1], read_text(run.folder.plan) or "The run's folder holds no plan."
     config = run.trainer.config
     columns = error_columns(metrics)
     masked = run.test.masks is not None
@@ -72,11 +70,10 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
     if run.test.photos.transparent:
         red, green, blue = (round(255 * value) for value in run.trainer.background.evaluated)
         on = f" Photos are transparent; they and the model are compared on rgb({red}, {green}, {blue})."
-    if "aligned_l1" in columns:
+    if "own_l1" in columns:
         on += (
             " Training photos have exposures of their own. A test photo is compared with the render in the exposure of"
-            " the training photos before and after it; beside that stand errors of the model's own colours, and those"
-            " after the affine map of these that fits the photo best."
+            " the training photos before and after it; beside that stand errors of the model's own colours."
         )
     if "refined_l1" in columns:
         on += (
@@ -108,7 +105,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
 {lpips}
 Means over the test views{unmasked}. Training time is that of iterations and of the initial error maps; loading,
 evaluation, checkpoints and this report are not in it. Wall time is from the start of the command until the model was
-written. FPS counts test views rendered one after the other. FLIP: `turbogs eval {folder}`.{on}
+written. FPS counts test views rendered one after the other.{on}
 
 `turbogs export {folder} --format html` writes a page with the model to turn in a browser, {exported}.
 
@@ -130,7 +127,9 @@ From left to right: photo, render, error (mean absolute difference over RGB: bla
 
 ## Plan
 
-{_plan(run.plan)}
+```text
+{plan.rstrip()}
+```
 
 ## Numerical events
 
@@ -149,10 +148,3 @@ finite: {last.skipped_updates}.
 {config.to_yaml().rstrip()}
 ```
 """
-
-
-def _plan(plan: Plan | None) -> str:
-    if plan is None:
-        return "The run's folder holds no plan."
-    rows = ((decision.setting, decision.text, decision.made, decision.reason) for decision in plan.decisions)
-    return table(("setting", "value", "made", "reason"), rows)

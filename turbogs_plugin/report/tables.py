@@ -13,7 +13,6 @@ ERRORS = {"psnr": "PSNR in dB", "ssim": "SSIM", "l1": "mean absolute error"}
 
 FURTHER_KINDS = {
     "own": "of the model's own colours",
-    "aligned": "after colour alignment",
     "refined": "by refined test cameras",
 }
 
@@ -39,12 +38,11 @@ def errors(measured: ViewMetrics | Evaluation, columns: Iterable[str] = ERRORS, 
 
 
 def error_columns(metrics: Metrics) -> dict[str, str]:
-    """Measure -> head of its column, for all measures of a model's test views: `ERRORS`, LPIPS, FLIP where it was
-    computed, and the kinds of `FurtherErrors` that were."""
+    """Measure -> head of its column, for all measures of a model's test views: `ERRORS`, LPIPS, and the kinds
+    of `FurtherErrors` that were computed."""
     computed = {name for name, value in metrics.mean.further().items() if name.endswith("l1") and not math.isnan(value)}
     further = {name: head for name, head in FURTHER.items() if f"{name.partition('_')[0]}_l1" in computed}
-    flip = {} if all(math.isnan(view.flip) for view in metrics.views) else {"flip": "FLIP"}
-    return ERRORS | {"lpips": "LPIPS (VGG)"} | flip | further
+    return ERRORS | {"lpips": "LPIPS (VGG)"} | further
 
 
 def views_table(metrics: Metrics, with_means: bool = False) -> str:

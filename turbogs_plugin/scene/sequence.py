@@ -20,12 +20,10 @@ class Neighbours:
         rows: [W, 2] int64, which of the known photos.
         weights: [W, 2] float32: of two neighbours, the nearer one weighs more, and both sum to 1; an only one has 1;
             where there is none, both are 0.
-        distances: [W] int64, to the nearer one, in photos; 0 where there is none.
     """
 
     rows: Tensor
     weights: Tensor
-    distances: Tensor
 
     def mean(self, values: Tensor) -> Tensor:
         """[W, ...]: the weighted mean of the neighbours' values [known, ...]; 0 where there is none."""
@@ -47,19 +45,18 @@ class PhotoOrder:
         self._places = {name: place for place, name in enumerate(ordered)}
         self._folders = np.unique([_folder(name) for name in ordered], return_inverse=True)[1]  # of each place
 
-    def neighbours(self, known: Sequence[str], photos: Sequence[str], apart: int = 1) -> Neighbours:
-        """The nearest known photos, at least `apart` photos before and after each photo; none is its own neighbour.
+    def neighbours(self, known: Sequence[str], photos: Sequence[str]) -> Neighbours:
+        """The nearest known photos before and after each photo; none is its own neighbour.
 
         Args:
             known: names of the photos of which something is known.
             photos: names of those whose neighbours are wanted.
-            apart: 1 or more.
         """
         there, here = self._places_of(known), self._places_of(photos)[:, None]  # [known], [W, 1]
         order = there.argsort()
         there = there[order]
-        before = np.searchsorted(there, here - apart, side="right") - 1
-        found = np.concatenate([before, np.searchsorted(there, here + apart)], axis=1)  # [W, 2]
+        before = np.searchsorted(there, here - 1, side="right") - 1
+        found = np.concatenate([before, np.searchsorted(there, here + 1)], axis=1)  # [W, 2]
         inside: NDArray[np.bool_] = np.logical_and(found >= 0, found < len(there))
         there, order, found[~inside] = np.append(there, 0), np.append(order, 0), -1  # -1: the one appended
         inside &= self._folders[there[found]] == self._folders[here]
@@ -67,8 +64,7 @@ class PhotoOrder:
         both = np.asarray(inside.all(axis=1, keepdims=True))
         weights = np.where(both, lengths[:, ::-1] / np.maximum(1, lengths.sum(axis=1, keepdims=True)), inside)
         rows = np.where(inside, order[found], 0)
-        nearer = np.where(both[:, 0], lengths.min(axis=1), lengths.max(axis=1))
-        return Neighbours(torch.from_numpy(rows), torch.from_numpy(weights).float(), torch.from_numpy(nearer))
+        return Neighbours(torch.from_numpy(rows), torch.from_numpy(weights).float())
 
     def _places_of(self, names: Sequence[str]) -> NDArray[np.int64]:
         return np.array([self._places[name] for name in names], dtype=np.int64)

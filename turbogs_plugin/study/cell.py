@@ -12,6 +12,7 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.device import free_device_memory
 from turbogs_plugin.plan import make_plan
+from turbogs_plugin.report.evaluation import load_lpips
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
@@ -19,7 +20,6 @@ from turbogs_plugin.study.results import CellResult, changes, curve_and_final, f
 from turbogs_plugin.train.clock import WallClock
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.metrics import Evaluations, evaluate
-from turbogs_plugin.train.perceptual import load_flip, load_lpips
 from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.train.trainer import Trainer
 
@@ -62,10 +62,9 @@ def train_cell(
         TrainingStopped: the model is lost.
     """
     lpips, lpips_reason = load_lpips(device)
-    flip, _ = load_flip()
     clock = WallClock()
     planned = make_plan(config, scene, device).apply(config)
-    test = place_views(scene.test, device, planned.train.photos_place)
+    test = place_views(scene.test, device, planned.train.pixels_place)
     clock.mark("cell")
     if not warm:
         warm_up(planned, scene, test, device)
@@ -83,9 +82,8 @@ def train_cell(
     final["cell_seconds"] = loading + clock.parts["cell"]
     if device.type == "cuda":  # a CPU's peak is the process's, of the largest cell so far
         final["peak_mib"] = evaluations.history[-1].memory_bytes / 2**20
-    if lpips is not None or flip is not None:  # off the clock
-        mean = evaluate(trainer.gaussians, test, trainer.look(test.names), lpips=lpips, flip=flip).mean
-        final["lpips"], final["flip"] = mean.lpips, mean.flip
+    if lpips is not None:  # off the clock
+        final["lpips"] = evaluate(trainer.gaussians, test, trainer.look(test.names), lpips).mean.lpips
     settings = flat_settings(config.to_mapping())
     return CellResult(
         scene=scene.name,

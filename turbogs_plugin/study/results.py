@@ -34,7 +34,7 @@ CURVE |= {name: name for name in ("psnr", "ssim", "l1")}
 LAST = ("worst_psnr", "refined_psnr", "refined_ssim", "nonfinite_losses", "skipped_updates")
 """Fields of the last `Evaluation` that a cell's `final` has besides the curve's columns."""
 
-DIGITS = {"seconds": 3, "psnr": 3, "ssim": 5, "l1": 6, "lpips": 5, "flip": 5, "fps": 1}
+DIGITS = {"seconds": 3, "psnr": 3, "ssim": 5, "l1": 6, "lpips": 5, "fps": 1}
 """Digits behind the point that the files keep of a measure, by the last word of its name."""
 
 
@@ -50,7 +50,7 @@ class CellResult:
         planned: settings that plan and budgets made of it, where they differ.
         curve: column, of `CURVE`, -> [E] its values at the evaluations, in the order of training.
         final: measure -> value of the final model: the curve's last values; ``worst_psnr`` of the worst test view;
-            ``refined_psnr`` and ``refined_ssim`` by refined test cameras; ``lpips``, ``flip``; ``fps``, test views
+            ``refined_psnr`` and ``refined_ssim`` by refined test cameras; ``lpips``; ``fps``, test views
             rendered a second; ``peak_mib``, peak of the GPU's tensors while training; ``wall_seconds`` of a run, from
             its process's start until its model was written; ``cell_seconds`` of a cell: loading its capture, plan,
             training and evaluations. Measures that were not taken are absent.

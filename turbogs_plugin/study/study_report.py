@@ -23,7 +23,6 @@ MEASURES = {
     "ssim": ("SSIM", 4),
     "refined_ssim": ("SSIM by refined test cameras", 4),
     "lpips": ("LPIPS (VGG)", 4),
-    "flip": ("FLIP", 4),
     "gaussians": ("Gaussians", 0),
     "fps": ("FPS", 0),
     "peak_mib": ("peak MiB", 0),

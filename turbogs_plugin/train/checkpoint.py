@@ -106,24 +106,15 @@ def require_like(saved: Any, present: Any, place: str) -> None:
         return
     fits = type(saved) is type(present)
     if fits and isinstance(present, dict):
-        if saved.keys() != present.keys():
-            names = ", ".join(sorted(map(str, saved.keys() ^ present.keys()))[:4])
-            raise ValueError(f"{place} lacks, or has in excess: {names}")
-        for key, value in present.items():
-            require_like(saved[key], value, f"{place}.{key}")
+        fits = saved.keys() == present.keys()
+        for key in present if fits else ():
+            require_like(saved[key], present[key], f"{place}.{key}")
     elif fits and isinstance(present, Tensor):
         fits = saved.dtype == present.dtype and saved.dim() == present.dim() and saved.shape[1:] == present.shape[1:]
-        if fits and not all(part.isfinite().all() for part in saved.reshape(-1).split(CHECKED_AT_ONCE)):
-            raise ValueError(f"{place} is not finite")
+        fits = fits and all(part.isfinite().all() for part in saved.reshape(-1).split(CHECKED_AT_ONCE))
     elif fits and isinstance(present, float):
         fits = math.isfinite(saved)
     elif fits and isinstance(present, int):
         fits = 0 <= saved < COUNT_LIMIT
     if not fits:
-        raise ValueError(f"{place} is {_layout(saved)}, which does not fit {_layout(present)}")
-
-
-def _layout(value: Any) -> str:
-    if isinstance(value, Tensor):
-        return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
-    return f"{type(value).__name__} {str(value)[:40]}"
+        raise ValueError(f"{place} is not finite, or has another form than this run's")

@@ -43,8 +43,8 @@ class WallRecord:
 
     Args:
         train_seconds: training, as in the history.
-        wall_seconds: from the start of the command until the model was written or the run was stopped; the sum over
-            commands for a resumed run, None where one of them was killed before it could say.
+        wall_seconds: from the start of the command until the model was written or the run was stopped; None for a
+            resumed run, which several commands made.
         parts: name -> seconds, of the newest command.
     """
 

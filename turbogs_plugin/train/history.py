@@ -22,8 +22,6 @@ class FurtherErrors:
     Args:
         own_psnr, own_ssim, own_l1: of the model's own colours, in runs that learn exposures; the plain ones there are
             of test views with the exposures of their neighbours (`interpolated_exposures`).
-        aligned_psnr, aligned_ssim, aligned_l1: of the model's own colours after a colour alignment (`align_colors`), in
-            runs that learn exposures.
         refined_psnr, refined_ssim, refined_l1: by refined cameras of the test photos (`PosedImages.refined`), at the
             end of runs whose capture says which photos show a point.
     """
@@ -31,9 +29,6 @@ class FurtherErrors:
     own_psnr: float = math.nan
     own_ssim: float = math.nan
     own_l1: float = math.nan
-    aligned_psnr: float = math.nan
-    aligned_ssim: float = math.nan
-    aligned_l1: float = math.nan
     refined_psnr: float = math.nan
     refined_ssim: float = math.nan
     refined_l1: float = math.nan
@@ -55,9 +50,9 @@ class Evaluation(FurtherErrors):
         memory_bytes: peak of the GPU's tensors, or of the process on a CPU; 0 where it was not kept.
         nonfinite_losses: iterations so far whose loss was not finite.
         skipped_updates: updates of Gaussians skipped so far because their gradient was not finite.
-        worst_psnr: PSNR of the worst test view; NaN in old files, which lack it.
+        worst_psnr: PSNR of the worst test view.
 
-    The others are means, too, and not written where they are NaN.
+    The others are means, too.
     """
 
     iteration: int
@@ -73,9 +68,7 @@ class Evaluation(FurtherErrors):
 
     def to_json(self) -> str:
         """One line; NaN is written as null."""
-        further = self.further()
-        plain = {name: None if value != value else value for name, value in asdict(self).items() if name not in further}
-        return json.dumps(plain | {name: value for name, value in further.items() if value == value})
+        return json.dumps({name: None if value != value else value for name, value in asdict(self).items()})
 
 
 def append_evaluation(path: Path, evaluation: Evaluation) -> None:
@@ -91,14 +84,13 @@ def read_history(path: Path) -> list[Evaluation]:
         InputError: unreadable, or a line that is not an evaluation.
     """
     text = read_text(path) or ""
-    names = {field.name for field in fields(Evaluation)}
     evaluations = []
     lines = text[: text.rfind("\n") + 1].splitlines()
     for number, line in enumerate(lines, start=1):
         if number == len(lines) and not line.endswith("}"):
             break
         try:
-            found = ((name, value) for name, value in json.loads(line).items() if name in names)
+            found = json.loads(line).items()
             values: dict[str, Any] = {name: math.nan if value is None else value for name, value in found}
             evaluations.append(Evaluation(**values))
         except (ValueError, TypeError, AttributeError):

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import torch
 
@@ -19,17 +17,18 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.agreement import require_agreement
 from turbogs_plugin.train.clock import WallClock
-from turbogs_plugin.train.run_files import RunFolder
 
 PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
 """Parts of the wall time in which photos are decoded, and the device is then waited for."""
 
 
-def resolve_device(name: str, remedy: str = "use --device cpu, or see 'turbogs doctor'") -> torch.device:
+def resolve_device(name: str) -> torch.device:
     """The device of ``auto``, ``cpu`` or ``cuda``. Raises `InputError` if CUDA is asked for and absent."""
     if name == "cuda" and not torch.cuda.is_available():
         build = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
-        raise InputError(f"CUDA was asked for and is absent ({build}): {remedy}")
+        raise InputError(
+            f"CUDA was asked for and is absent ({build}): see 'turbogs doctor', or begin with --device cpu"
+        )
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
@@ -40,11 +39,10 @@ def show_loading(loaded: int, total: int) -> None:
         print(text, end="", file=sys.stderr, flush=True)
 
 
-def open_scene(config: Config, folder: RunFolder | None = None, ranks: Ranks = ONE) -> Scene:
+def open_scene(config: Config, ranks: Ranks = ONE) -> Scene:
     """The capture of a configuration. On a terminal, its photos are counted while they are decoded.
 
     Args:
-        folder: of the run with this configuration; None if the user names the capture.
         ranks: the processes that train together; each calls this. The first one refines cameras for all: machines
             differ in their last digits, and replicas may not.
 
@@ -52,32 +50,20 @@ def open_scene(config: Config, folder: RunFolder | None = None, ranks: Ranks = O
         InputError: there is no usable capture, or no training on it can work.
     """
     settings = config.scene
-    if folder is not None and not Path(settings.path).exists():
-        raise InputError(
-            f"capture '{settings.path}' of the run in '{folder.path}' is not there: bring it back, or edit scene.path "
-            f"in {folder.config}"
-        )
     scene = load_scene(settings.path, settings.factor, settings.test_every, show_loading if ranks.first else None)
-    if folder is None and not settings.force:
+    if not settings.force:
         require_agreement(scene)
     cameras = find_cameras(scene, config.train.refine_cameras) if ranks.first else None
     return with_cameras(scene, ranks.agree(cameras))
 
 
-def open_started(
-    config: Config,
-    resolve: Callable[[], torch.device],
-    clock: WallClock,
-    folder: RunFolder | None = None,
-    ranks: Ranks = ONE,
-) -> tuple[Scene, torch.device]:
+def open_started(config: Config, clock: WallClock, ranks: Ranks = ONE) -> tuple[Scene, torch.device]:
     """The capture, and the device with its kernels loaded: a thread starts it, in a second or more, while photos are
     decoded.
 
     Args:
-        resolve: says which device; what it raises is raised here.
         clock: of the wall, on which `PHOTOS` and `DEVICE` are marked.
-        folder, ranks: as for `open_scene`. Where one process ends before, the others wait until their launcher ends
+        ranks: as for `open_scene`. Where one process ends before, the others wait until their launcher ends
             them.
 
     Raises:
@@ -85,7 +71,7 @@ def open_started(
     """
 
     def start() -> torch.device:
-        device = resolve()
+        device = resolve_device(config.train.device)
         ranks.meet(device)
         synchronize(device)  # makes CUDA's context, and takes no memory through torch
         if device.type == "cuda":
@@ -94,7 +80,7 @@ def open_started(
 
     with ThreadPoolExecutor(1) as pool:
         started = pool.submit(start)
-        scene = open_scene(config, folder, ranks)
+        scene = open_scene(config, ranks)
         clock.mark(PHOTOS)
         device = started.result()
     clock.mark(DEVICE)

@@ -81,22 +81,19 @@ class Look:
 
     def colors(self, colors: Tensor, view_id: int) -> Tensor:
         """[H, W, 3], 0 .. 1: the model's own colours [H, W, 3], seen by a view, with its exposure."""
-        return (colors if self.exposures is None else exposed(colors, self.exposures[view_id])).clamp(0.0, 1.0)
-
-
-def exposed(colors: Tensor, exposure: Tensor) -> Tensor:
-    """[..., 3]: ``c + A c + b`` of colours c [..., 3], by an exposure [3, 4]."""
-    return colors + (colors @ exposure[:, :3].T + exposure[:, 3])
+        if self.exposures is not None:
+            exposure = self.exposures[view_id]  # [3, 4], A | b: a colour c becomes c + A c + b
+            colors = colors + (colors @ exposure[:, :3].T + exposure[:, 3])
+        return colors.clamp(0.0, 1.0)
 
 
 def interpolated_exposures(offsets: Tensor, trained: Sequence[str], photos: Sequence[str]) -> Tensor:
     """[W, 3, 4] float32, ``A | b`` of photos: the mean of their neighbours', times how well it tells exposures.
 
-    How well is measured on the training photos, as if each were left out together with all that are nearer than the
-    photo's neighbour is (rounded up to a power of two): the slope of the least squares of their exposures against their
+    How well is measured on the training photos: the slope of the least squares of their exposures against their
     neighbours' mean, within 0 .. 1. It is nearly 1 where exposures follow the sequence, and 0, which gives the
-    identity, where they differ at random, as in a collection of many people's photos, or where a long part of the
-    sequence is missing. A photo without a neighbour has the identity, too.
+    identity, where they differ at random, as in a collection of many people's photos. A photo without a neighbour has
+    the identity, too.
 
     Args:
         offsets: [V, 3, 4], of the training photos (`turbogs_plugin.engine.exposures.Exposures`).
@@ -104,13 +101,7 @@ def interpolated_exposures(offsets: Tensor, trained: Sequence[str], photos: Sequ
         photos: [W] names; a training photo gets its neighbours' exposure, not its own.
     """
     order = PhotoOrder([*trained, *photos])
-    found = order.neighbours(trained, photos)
-    told = found.mean(offsets)
-    steps = 2 ** found.distances.clamp(min=1).log2().ceil().long()  # [W]
-    for apart in steps.unique().tolist():
-        there = (steps == apart).to(offsets.device)
-        told[there] *= _slope(offsets, order.neighbours(trained, trained, apart))
-    return told
+    return order.neighbours(trained, photos).mean(offsets) * _slope(offsets, order.neighbours(trained, trained))
 
 
 def _slope(offsets: Tensor, among: Neighbours) -> float:

@@ -27,9 +27,6 @@ class Listener:
     def evaluation_due(self, loop: TrainingLoop) -> None:
         """The pace asks for an evaluation here."""
 
-    def evaluating(self, loop: TrainingLoop) -> None:
-        """An evaluation begins."""
-
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         """An evaluation was made."""
 

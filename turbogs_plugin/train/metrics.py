@@ -1,15 +1,15 @@
-"""Test errors of a model: PSNR, SSIM, mean absolute error, LPIPS and FLIP if wanted and there; rendering speed; and
-the evaluations of a training.
+"""Test errors of a model: PSNR, SSIM, mean absolute error, LPIPS if wanted and there; rendering speed; and the
+evaluations of a training.
 
-Where views have masks, errors are of the pixels that are not masked.
-Where photos have exposures of their own, a test view is shown with the exposure that is known of it, and errors of the
-model's own colours, before and after a colour alignment, are given beside.
+Where views have masks, errors are of the pixels that are not masked. Where photos have exposures of their own, a test
+view is shown with the exposure that is known of it, and errors of the model's own colours are given beside.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 
 import torch
@@ -22,7 +22,6 @@ from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.history import MEASURES, Evaluation, FurtherErrors
 from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.loop import Listener, TrainingLoop
-from turbogs_plugin.train.perceptual import ImageError
 from turbogs_plugin.types import Gaussians
 
 PSNR_LIMIT = 100.0
@@ -37,18 +36,20 @@ SSIM_SIGMA = 1.5
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 """Constants of Wang et al. 2004 for values 0 .. 1."""
 
+ImageError = Callable[[Tensor, Tensor], float]
+"""LPIPS of an image against a photo, both [H, W, 3], 0 .. 1."""
+
 
 @dataclass
 class ViewMetrics(FurtherErrors):
-    """Errors of one test view, without its masked pixels; `ssim`, `lpips` and `flip` are NaN where they cannot be
-    computed or are not wanted."""
+    """Errors of one test view, without its masked pixels; `ssim` and `lpips` are NaN where they cannot be computed or
+    are not wanted."""
 
     name: str
     psnr: float
     ssim: float
     l1: float
     lpips: float = math.nan
-    flip: float = math.nan
 
 
 @dataclass
@@ -83,8 +84,6 @@ def evaluate(
     views: PosedImages,
     look: Look,
     lpips: ImageError | None = None,
-    flip: ImageError | None = None,
-    aligned: bool = False,
     refined: bool = False,
 ) -> Metrics:
     """Render every view, one at a time, and compare it with its photo. Where views have exposures, errors of the
@@ -94,9 +93,7 @@ def evaluate(
         gaussians: the model, on the views' device.
         views: cameras and photos.
         look: how the model is shown.
-        lpips: from `load_lpips`, if wanted.
-        flip: from `load_flip`, if wanted. LPIPS and FLIP see the photo's pixels where it is masked.
-        aligned: give the errors of the model's own colours after `align_colors`, too.
+        lpips: from `load_lpips`, if wanted. It sees the photo's pixels where it is masked.
         refined: where views have refined cameras, give the errors by these cameras, too.
     """
     metrics: list[ViewMetrics] = []
@@ -111,22 +108,15 @@ def evaluate(
         seconds += time.perf_counter() - started
         photo, mask = views.photos.image(view_id, look.background), views.mask(view_id)
         measured = compare(name, image, photo, mask)
-        further: dict[str, ViewMetrics] = {}
-        own = own.clamp(0.0, 1.0)
-        if look.exposures is not None:
-            further["own"] = compare(name, own, photo, mask)
+        further = {} if look.exposures is None else {"own": own.clamp(0.0, 1.0)}
         if moved is not None:
-            further["refined"] = compare(name, render_view(gaussians, moved, view_id, look), photo, mask)
-        if aligned:
-            further["aligned"] = compare(name, align_colors(own, photo, mask), photo, mask)
-        for kind, other in further.items():
+            further["refined"] = render_view(gaussians, moved, view_id, look)
+        for kind, shown in further.items():
+            other = compare(name, shown, photo, mask)
             for measure in MEASURES:
                 setattr(measured, f"{kind}_{measure}", getattr(other, measure))
-        unmasked = image if mask is None else _unmasked(image, photo, mask)
         if lpips is not None:
-            measured.lpips = lpips(unmasked, photo)
-        if flip is not None:
-            measured.flip = flip(unmasked, photo)
+            measured.lpips = lpips(image if mask is None else _unmasked(image, photo, mask), photo)
         metrics.append(measured)
     return Metrics(metrics, fps=len(metrics) / seconds)
 
@@ -160,18 +150,6 @@ def compare(name: str, image: Tensor, photo: Tensor, mask: Tensor | None = None)
     if mask is not None:
         image, photo = image[mask], photo[mask]  # [P, 3]
     return ViewMetrics(name, psnr(image, photo), similarity, (image - photo).abs().mean().item())
-
-
-def align_colors(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
-    """[H, W, 3], 0 .. 1: the image with its colours mapped by the affine map, 3x4, that brings them closest to the
-    photo's, in the sense of least squares over the pixels of the mask [H, W]."""
-    rows = image.reshape(-1, 3) if mask is None else image[mask]
-    targets = photo.reshape(-1, 3) if mask is None else photo[mask]
-    rows, targets = torch.nn.functional.pad(rows, (0, 1), value=1.0).double(), targets.double()  # [P, 4], [P, 3]
-    # Few numbers: on the CPU, and by the pseudo-inverse, as an image of one colour has many such maps.
-    inverse = torch.linalg.pinv((rows.T @ rows).cpu(), rtol=1e-9, hermitian=True)
-    affine = (inverse @ (rows.T @ targets).cpu()).to(image)  # [4, 3]
-    return (image @ affine[:3] + affine[3]).clamp(0.0, 1.0)
 
 
 def _unmasked(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
@@ -224,31 +202,24 @@ class Evaluations(Listener):
 
     Attributes:
         history: every evaluation.
-        metrics: errors of the newest one.
+        metrics: errors of the newest one; None where this process made none.
     """
 
     test: PosedImages
     history: list[Evaluation] = field(default_factory=list, init=False)
     metrics: Metrics | None = field(default=None, init=False)
 
-    def metrics_at(self, iteration: int) -> Metrics | None:
-        """Errors of this process's newest evaluation, if it was made at this iteration; None otherwise."""
-        return self.metrics if self.history and self.history[-1].iteration == iteration else None
-
     def begun(self, loop: TrainingLoop) -> None:
         if not self.history:
             self.evaluation_due(loop)
 
     def evaluation_due(self, loop: TrainingLoop) -> None:
-        for listener in loop.listeners:
-            listener.evaluating(loop)
         trainer = loop.trainer
         trainer.require_finite()
         metrics = evaluate(
             trainer.gaussians,
             self.test,
             trainer.look(self.test.names),
-            aligned=trainer.exposures is not None,
             refined=loop.finished,
         )
         mean = metrics.mean

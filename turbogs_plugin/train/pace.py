@@ -19,7 +19,7 @@ from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.config.sections import TrainConfig
 from turbogs_plugin.device import free_device_memory, synchronize
 from turbogs_plugin.distributed.ranks import ONE, Ranks
-from turbogs_plugin.plan.caps import without_growth
+from turbogs_plugin.plan.memory import cap_of
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.trainer import Trainer
 
@@ -142,7 +142,8 @@ def fitted_to_time(config: Config, scene: Scene, device: torch.device, ranks: Ra
     if budget is None:
         return config, 0.0
     count, clock = TRIAL_ITERATIONS[device.type], TrainingClock(device)
-    trial = Trainer(without_growth(config), scene, device, engine=ranks.engine(device))
+    still = config.changed(density={"type": "none", "max_gaussians": cap_of(config)})  # the initial model all the time
+    trial = Trainer(still, scene, device, engine=ranks.engine(device))
     trial.iteration = int(config.train.iterations) // 2  # views, pixels and bands of an iteration are near their means
     for _ in range(2):  # the first time loads code and sizes buffers
         begun = clock.seconds

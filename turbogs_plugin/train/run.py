@@ -18,10 +18,10 @@ from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.plan import Plan, make_plan
-from turbogs_plugin.plan.memory import hold_to_limit, most_views, require_gpu_memory, within_memory
+from turbogs_plugin.plan.memory import hold_to_limit, most_views, within_memory
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
-from turbogs_plugin.train.clock import WallClock, WallRecord
+from turbogs_plugin.train.clock import WallClock
 from turbogs_plugin.train.history import rewind_history
 from turbogs_plugin.train.inputs import open_scene, open_started, resolve_device
 from turbogs_plugin.train.loop import TrainingLoop
@@ -45,27 +45,11 @@ def plan_run(config: Config, processes: int = 1) -> Plan:
     Raises:
         InputError: as `train`.
     """
-    require_possible(config)
     device = resolve_device(config.train.device)
     scene = open_scene(config)
     plan = make_plan(config, scene, device, processes)
     print("\n".join(scene.notes), file=sys.stderr)  # last, as an error is one line alone
     return plan
-
-
-def require_possible(config: Config) -> None:
-    """Refuse a device or a limit of its memory that this machine lacks, and a model to start from that is not there,
-    before photos are looked at.
-
-    Raises:
-        InputError: one of these.
-    """
-    if config.train.device == "cuda":
-        resolve_device("cuda")
-    if config.budget.max_memory:
-        require_gpu_memory(resolve_device(config.train.device))
-    if config.train.starts_from_model:
-        require_model(config.train.init)
 
 
 def new_loop(config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE) -> TrainingLoop:
@@ -143,25 +127,25 @@ def train(
     folder = RunFolder(out)
     if ranks.first:
         folder.require_new()
-    require_possible(config)
+    if config.train.starts_from_model:
+        require_model(config.train.init)  # before minutes of photos
     posed = ranks.agree(_posed_capture(config, out) if ranks.first else "")
     if posed != config.scene.path:
         clock.mark(CAMERAS)
         config = replace(config, scene=replace(config.scene, path=posed))
-    scene, device = open_started(config, lambda: resolve_device(config.train.device), clock, ranks=ranks)
+    scene, device = open_started(config, clock, ranks)
     plan = make_plan(config, scene, device, ranks.count)
     clock.mark("plan")
-    remedy = "use train.photos_place=host and train.maps_place=host, --max-gaussians or a larger --factor"
-    with _fitting(scene, remedy):
+    with _fitting(scene):
         loop = new_loop(_independent(plan.apply(config), device), scene, device, ranks)
-        session = RunSession(folder, plan, scene, loop, clock)
+        session = RunSession(folder, scene, loop, clock)
     if ranks.first:
         resolved = loop.trainer.config
         print("\n".join([*scene.notes, plan.text()]), file=sys.stderr)
         if resolved.budget.time:
             print(f"{resolved.budget.time} of training: about {resolved.train.iterations} iterations", file=sys.stderr)
         folder.path.mkdir(parents=True, exist_ok=True)
-        write_text_atomically(folder.plan, plan.to_json())
+        write_text_atomically(folder.plan, plan.text() + "\n")
         write_text_atomically(folder.asked, config.to_yaml())
         write_text_atomically(folder.config, resolved.to_yaml())
     return session.run(report, watch)
@@ -185,24 +169,21 @@ def resume(
     clock = clock or WallClock()
     clock.mark(IMPORTS)
     folder = RunFolder(path)
-    config, plan = folder.read_config(), folder.read_plan()
-    earlier = WallRecord.read(folder.wall)
+    config = folder.read_config()
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None and folder.model.is_file():
         raise InputError(f"'{path}' is finished and has no checkpoint to go on from: use its {folder.model.name}")
     state = None if checkpoint is None else load_checkpoint(checkpoint)
-    device = resolve_device(config.train.device, "go on with this run where there is a GPU, or see 'turbogs doctor'")
     require_writable(folder.path, f"what --resume {folder.path} writes")
-    scene, device = open_started(config, lambda: device, clock, folder, ranks)
+    scene, device = open_started(config, clock, ranks)
     hold_to_limit(config, device)
-    with _fitting(scene, "end what else is in that memory, or go on with this run where there is more"):
+    with _fitting(scene):
         resuming = state is not None
         trainer = Trainer(config, scene, device, resuming, ranks.engine(device))
         loop = TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), ranks=ranks)
-        session = RunSession(folder, plan, scene, loop, clock)
+        session = RunSession(folder, scene, loop, clock)
         if state is not None:
             session.load_state_dict(state, str(checkpoint))
-            session.earlier_wall = earlier.wall_seconds if earlier else None
     if ranks.first:
         session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
     return session.run(report, watch)
@@ -218,8 +199,9 @@ def _posed_capture(config: Config, out: Path) -> str:
 
 
 @contextmanager
-def _fitting(scene: Scene, remedy: str) -> Iterator[None]:
+def _fitting(scene: Scene) -> Iterator[None]:
     """Turn a lack of device memory before training into an `InputError` that names a remedy."""
+    remedy = "use train.pixels_place=host, --max-gaussians or a larger --factor, or end what else is in that memory"
     try:
         yield
     except torch.cuda.OutOfMemoryError:

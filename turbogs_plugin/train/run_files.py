@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
 from turbogs_plugin.config.configuration import Config, resolve_complete
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import read_text, require_writable
-from turbogs_plugin.plan import Plan
+from turbogs_plugin.files import require_writable
 from turbogs_plugin.yaml_json import read_yaml
 
 
@@ -26,7 +24,7 @@ class RunFolder:
         self.path = path
         self.asked = path / "asked.yaml"
         self.config = path / "config.yaml"
-        self.plan = path / "plan.json"
+        self.plan = path / "plan.txt"
         self.history = path / "history.jsonl"
         self.wall = path / "wall.json"
         self.checkpoints = path / "checkpoints"
@@ -37,13 +35,8 @@ class RunFolder:
 
     def require_new(self) -> None:
         """Raise `InputError` if the folder holds anything, or cannot be made."""
-        if self.config.exists():
-            quoted = shlex.quote(str(self.path))
-            raise InputError(f"'{self.path}' holds another run: choose a new --out, or go on with --resume {quoted}")
-        if self.path.exists() and not self.path.is_dir():
-            raise InputError(f"--out '{self.path}' is a file: choose a folder")
-        if self.path.is_dir() and any(self.path.iterdir()):
-            raise InputError(f"--out '{self.path}' is not empty: choose a new folder")
+        if self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir())):
+            raise InputError(f"--out '{self.path}' is not empty: choose a new folder, or go on with a run by --resume")
         require_writable(self.path, f"--out '{self.path}'")
 
     def finished(self, reported: bool) -> bool:
@@ -60,21 +53,14 @@ class RunFolder:
 
     def read_config(self) -> Config:
         """The resolved configuration of the run. Raises `InputError` if this is no run, or part of it is missing."""
-        if not self.config.is_file():
-            lacks = "config.yaml in it" if self.path.exists() else "such folder"
-            raise InputError(f"'{self.path}' holds no run: there is no {lacks}; give a folder that train --out made")
-        return resolve_complete(read_yaml(self.config), str(self.config), decided=True)
+        return self._read(self.config, decided=True)
 
     def read_asked(self) -> Config:
         """The configuration that was asked for. Raises `InputError` if it is missing or incomplete."""
-        if not self.asked.is_file():
-            raise InputError(f"'{self.path}' has no {self.asked.name}, which says what was asked for: train anew")
-        return resolve_complete(read_yaml(self.asked), str(self.asked))
+        return self._read(self.asked, decided=False)
 
-    def read_plan(self) -> Plan | None:
-        """The plan made when the run began, or None. Raises `InputError` if it cannot be read."""
-        text = read_text(self.plan)
-        try:
-            return None if text is None else Plan.from_json(text)
-        except InputError as error:
-            raise InputError(f"cannot read the plan '{self.plan}': {error}") from None
+    def _read(self, file: Path, decided: bool) -> Config:
+        if not file.is_file():
+            lacks = f"{file.name} in it" if self.path.exists() else "such folder"
+            raise InputError(f"'{self.path}' holds no run: there is no {lacks}; give a folder that train --out made")
+        return resolve_complete(read_yaml(file), str(file), decided)

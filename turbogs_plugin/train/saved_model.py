@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import operator
 import re
-import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +32,7 @@ from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
 
 REMEDY = "; save the model again, or as a .ply"
-KINDS = "a .ply, .splat, .spz or gsplat's .pt of a 3DGS model, a checkpoint of TurboGS, or a run's folder"
+KINDS = "a .ply, .spz or gsplat's .pt of a 3DGS model, a checkpoint of TurboGS, or a run's folder"
 
 
 @dataclass
@@ -77,11 +76,7 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
     config = folder.read_config()
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None:
-        run, model = shlex.quote(str(path)), shlex.quote(str(folder.model))
-        raise InputError(
-            f"'{path}' has no checkpoint: let the run go on with  turbogs train --resume {run}, or give its finished "
-            f"model by  {model} --scene {shlex.quote(config.scene.path)}"
-        )
+        raise InputError(f"'{path}' has no checkpoint: let the run go on with --resume, or give its model and --scene")
     state = load_checkpoint(checkpoint)
     try:
         trained = state["trainer"]
@@ -117,7 +112,7 @@ def load_with_capture(
         return SavedModel(None, given, gaussians, scene.frame, None), scene, ""
     model = load_model(path, device)
     try:
-        return model, open_scene(model.config, model.folder), ""
+        return model, open_scene(model.config), ""
     except InputError as error:
         if needed:
             raise
@@ -157,22 +152,21 @@ def load_given(path: str | Path, scene: Scene, world: str = "capture") -> Gaussi
     Raises:
         InputError: the file is no such model, or the capture does not determine gsplat's world.
     """
-    file = require_model(path)
     into = Similarity.into(scene.frame)
-    gaussians, to_capture = _read(file)
+    gaussians, to_capture = read_given(path)
     if to_capture is None and world == "gsplat":
         points = scene.frame.restore_points(scene.points.cpu().numpy())
         to_capture = out_of_gsplat_world(gaussians, _own_viewmats(scene), points, scene.point_colors.cpu().numpy())
         if to_capture is None:
             raise InputError(
-                f"{file}: the cameras and points of {scene.name} do not determine gsplat's normalised world: train the "
+                f"{path}: the cameras and points of {scene.name} do not determine gsplat's normalised world: train the "
                 "model with --no-normalize-world-space, and leave train.init_world out"
             )
-    return placed(gaussians, into if to_capture is None else into.after(to_capture), file)
+    return placed(gaussians, into if to_capture is None else into.after(to_capture), path)
 
 
-def read_given(path: str | Path) -> Gaussians:
-    """A model from a file alone, whatever capture it belongs to.
+def read_given(path: str | Path) -> tuple[Gaussians, Similarity | None]:
+    """A model from a file alone, and the change to its capture's own coordinates where the file knows it.
 
     Returns:
         float64, on the CPU, in the file's own coordinates; rows may be not finite.
@@ -180,22 +174,16 @@ def read_given(path: str | Path) -> Gaussians:
     Raises:
         InputError: the file is no such model (`require_model`).
     """
-    return _read(require_model(path))[0]
-
-
-def _read(file: Path) -> tuple[Gaussians, Similarity | None]:
-    """The model of a file in float64, and the change to the capture's own coordinates where the file knows it."""
+    file = require_model(path)
     kind = file.suffix.lower().removeprefix(".")
     if kind != "pt":
         return FORMATS[kind].read(file), None
     state = read_plain(file, f"'{file}'", REMEDY)
     if isinstance(state, Mapping) and "splats" in state:
-        files = [file, *_other_ranks(file)]
+        of_ranks = re.compile(re.sub(r"_rank\d+$", r"_rank\\d+", re.escape(file.stem)))  # with several, each has a part
+        files = sorted(path for path in file.parent.glob("*.pt") if of_ranks.fullmatch(path.stem))
         parts = [read_gsplat(read_plain(part, f"'{part}'", REMEDY), part) for part in files]
-        if len({part.shN.shape[1] for part in parts}) > 1:
-            raise InputError(f"{file}: the files of its ranks differ in degree: give the files of one run")
-        names = PARAMETER_NAMES
-        return Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names}), None
+        return Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name in PARAMETER_NAMES}), None
     try:
         gaussians = read_gsplat({"splats": state["trainer"]["gaussians"]}, file)
         return gaussians, Similarity.into(frame_of_state(state)).inverse()
@@ -204,15 +192,6 @@ def _read(file: Path) -> tuple[Gaussians, Similarity | None]:
         raise InputError(
             f"{file} is neither gsplat's checkpoint (step, splats) nor one of TurboGS (it has {keys}): give {KINDS}"
         ) from None
-
-
-def _other_ranks(file: Path) -> list[Path]:
-    """The files with the rest of a model that several GPUs trained: ckpt_STEP_rank1.pt beside ckpt_STEP_rank0.pt."""
-    name = re.fullmatch(r"(.*_rank)\d+\.pt", file.name)
-    if name is None:
-        return []
-    alike = re.compile(re.escape(name[1]) + r"\d+\.pt")
-    return sorted(path for path in file.parent.iterdir() if path != file and alike.fullmatch(path.name))
 
 
 def _own_viewmats(scene: Scene) -> np.ndarray:

@@ -1,19 +1,20 @@
-"""The training of a run in one process, and what it writes into the run's folder."""
+"""The training of a run in one process: what it writes into the run's folder, and its progress on stderr."""
 
 from __future__ import annotations
 
 import signal
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.ply import save_ply
-from turbogs_plugin.plan import Plan
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.scene.offload import place_views
@@ -22,13 +23,17 @@ from turbogs_plugin.train.clock import WallClock, WallRecord
 from turbogs_plugin.train.history import Evaluation, append_evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.metrics import Evaluations
-from turbogs_plugin.train.progress import TrainingProgress
 from turbogs_plugin.train.run_files import RunFolder
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 Report = Callable[["RunSession"], object]
 """Writes the report of a finished run."""
 Watch = Sequence[Callable[["RunSession"], Listener]]
 """Functions that are called with a run before it trains, and give one more listener of its first process each."""
+REFRESH_SECONDS = 0.1
+"""Time between two updates of the bar, so that fast iterations are not slowed down."""
 
 
 @contextmanager
@@ -56,24 +61,19 @@ class RunSession(Listener):
     """The part of a run in one process: trains, and writes the results into the run's folder.
 
     Attributes:
-        plan: the plan of the run; None if its folder holds none.
         test: the test views, on the trainer's device.
         history: every evaluation of the run.
         resumed: whether the trainer's state was loaded.
         signal: the signal that stopped the training; None at the end of the run.
         clock: of the wall, in this process.
-        earlier_wall: seconds on the wall of the processes before; None where one did not record them.
         wall: what is recorded of it when the model is written.
     """
 
-    def __init__(
-        self, folder: RunFolder, plan: Plan | None, scene: Scene, loop: TrainingLoop, clock: WallClock | None = None
-    ) -> None:
-        self.folder, self.plan, self.scene, self.loop = folder, plan, scene, loop
+    def __init__(self, folder: RunFolder, scene: Scene, loop: TrainingLoop, clock: WallClock | None = None) -> None:
+        self.folder, self.scene, self.loop = folder, scene, loop
         self.clock, self.wall = clock or WallClock(), WallRecord(0.0)
-        self.earlier_wall: float | None = 0.0
         self.trainer = loop.trainer
-        self.test = place_views(scene.test, self.trainer.device, self.trainer.config.train.photos_place)
+        self.test = place_views(scene.test, self.trainer.device, self.trainer.config.train.pixels_place)
         self.evaluations = Evaluations(self.test)
         self.history = self.evaluations.history
         self.resumed = False
@@ -83,9 +83,6 @@ class RunSession(Listener):
     def run(self, report: Report | None, watch: Watch = ()) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint. The model is written before it."""
         loop, trainer, ranks = self.loop, self.trainer, self.loop.ranks
-        finished_before = loop.finished
-        if ranks.first:
-            self.folder.wall.unlink(missing_ok=True)  # so that a killed process leaves none: it is not counted as 0
         self.clock.mark("initial model")
         try:
             with interruptible(self._stop), ExitStack() as shown:
@@ -99,15 +96,14 @@ class RunSession(Listener):
                     trainer.require_finite()
                     save_ply(trainer.gaussians, self.folder.model, self.scene.frame)
                     self.clock.mark("model")
-                seconds = 0.0 if finished_before else self.clock.seconds
+                seconds = None if self.resumed else self.clock.seconds
                 if trainer.iteration != self._saved_at:
                     trainer.complete()
                     self._save()
             self.signal = None if loop.finished else ranks.stop_signal or self.signal
             if not ranks.first:
                 return self
-            wall = None if self.earlier_wall is None else self.earlier_wall + seconds
-            self.wall = WallRecord(loop.clock.seconds, wall, self.clock.parts)
+            self.wall = WallRecord(loop.clock.seconds, seconds, self.clock.parts)
             if loop.finished and report is not None:
                 report(self)
             self.wall.write(self.folder.wall)
@@ -133,7 +129,7 @@ class RunSession(Listener):
     def begun(self, loop: TrainingLoop) -> None:
         self.clock.mark("initial maps")
 
-    def evaluating(self, loop: TrainingLoop) -> None:
+    def evaluation_due(self, loop: TrainingLoop) -> None:
         self.clock.mark("training")
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
@@ -186,3 +182,53 @@ class RunSession(Listener):
     def _last_good(self) -> str:
         checkpoint = latest_checkpoint(self.folder.checkpoints)
         return f"the last good checkpoint is '{checkpoint}'" if checkpoint else "no checkpoint was saved before"
+
+
+class TrainingProgress(Listener):
+    """Shows iteration, time left, iterations a second, test PSNR and number of Gaussians.
+
+    rich is imported for a terminal alone. A context: the bar is shown while it is entered.
+    """
+
+    def __init__(self) -> None:
+        self._next_refresh = 0.0
+        self._psnr = self._warning = ""
+        self._bar: Progress | None = None
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+            said = TextColumn("{task.description}")
+            columns = (MofNCompleteColumn(), BarColumn(None), TimeRemainingColumn(), said)
+            self._bar = Progress(*columns, console=Console(stderr=True), auto_refresh=False, expand=True)
+            self._task = self._bar.add_task("", total=None)
+
+    def __enter__(self) -> TrainingProgress:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def advanced(self, loop: TrainingLoop) -> None:
+        if self._bar is None or time.perf_counter() < self._next_refresh:
+            return
+        self._next_refresh = time.perf_counter() + REFRESH_SECONDS
+        trainer, speed = loop.trainer, self._bar.tasks[0].speed or 0.0
+        said = f"{speed:,.0f} it/s  {self._psnr}{len(trainer.gaussians):,} Gaussians  {self._warning}"
+        self._bar.update(self._task, completed=trainer.iteration, total=trainer.iterations, description=said)
+        self._bar.refresh()
+
+    def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
+        counts = {"non-finite losses": evaluation.nonfinite_losses, "skipped updates": evaluation.skipped_updates}
+        self._psnr = f"PSNR {evaluation.psnr:.2f} dB  "
+        self._warning = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+        if self._bar is None:
+            total = loop.trainer.iterations
+            line = (
+                f"iteration {evaluation.iteration:>{len(str(total))}}/{total}  {evaluation.train_seconds:7.1f} s  "
+                f"test {self._psnr}SSIM {evaluation.ssim:.4f}  {evaluation.num_gaussians} Gaussians  {self._warning}"
+            )
+            print(line.rstrip(), file=sys.stderr, flush=True)

@@ -12,21 +12,28 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from turbogs_plugin.captures.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine
-from turbogs_plugin.engine.exposures import expose
+from turbogs_plugin.engine.exposures import Exposures, expose
 from turbogs_plugin.engine.render import dense_samples, rasterize
-from turbogs_plugin.errors import TrainingStopped
+from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.gsplat_file import read_gsplat
-from turbogs_plugin.scene import Scene
+from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points, with_degree
+from turbogs_plugin.plan.memory import cap_of
+from turbogs_plugin.plan.photo_gains import compare_exposures
+from turbogs_plugin.scene import PosedImages, Scene
+from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.scene.offload import place_maps, place_views
-from turbogs_plugin.train.initial_state import first_exposures, initial_gaussians
 from turbogs_plugin.train.look import Background, Look, interpolated_exposures
 from turbogs_plugin.train.parameter_mean import ParameterMean
+from turbogs_plugin.train.saved_model import load_given
 from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
 
 STATEFUL = ("maps", "view_sampler", "optimizer", "density")
 """Attributes that have a state of their own."""
+COLOR_STRIDE = 97
+"""The mean colour of the photos is taken over every 97th pixel; coprime to usual widths."""
 
 
 class TrainingState:
@@ -50,8 +57,8 @@ class TrainingState:
     def __init__(self, config: Config, scene: Scene, device: torch.device, resuming: bool, engine: Engine) -> None:
         train = config.train
         self.config, self.engine, self.extent = config, engine, scene.extent
-        self.views = place_views(scene.train, device, train.photos_place)
-        self.maps = place_maps(self.views.cameras.sizes, device, train.maps_place, config.maps.beta, self.views.masks)
+        self.views = place_views(scene.train, device, train.pixels_place)
+        self.maps = place_maps(self.views.cameras.sizes, device, train.pixels_place, config.maps.beta, self.views.masks)
         self.background = Background.of(train.background, self.views.photos.transparent)
         self.exposures = first_exposures(scene, resuming, device) if train.exposure else None
         self.view_sampler = config.build("view_sampler")
@@ -177,12 +184,11 @@ class TrainingState:
         Raises:
             TrainingStopped: a parameter is not finite, which later iterations would not repair.
         """
-        for name, tensor in self.gaussians.items():
-            bad = int((~tensor.isfinite()).reshape(len(tensor), -1).any(dim=1).sum()) if tensor.numel() else 0
-            if bad:
-                raise TrainingStopped(
-                    f"iteration {self.iteration}: {name} of {bad} of {len(tensor)} Gaussians are not finite"
-                )
+        bad = int((~self.gaussians.finite_rows()).sum())
+        if bad:
+            raise TrainingStopped(
+                f"iteration {self.iteration}: {bad} of {len(self.gaussians)} Gaussians are not finite"
+            )
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that iterations change, as plain tensors and numbers.
@@ -222,3 +228,69 @@ class TrainingState:
             self.parameter_mean.load_state_dict(state["parameter_mean"], self.device)
         for name in STATEFUL:
             getattr(self, name).load_state_dict(state[name])
+
+
+def first_exposures(scene: Scene, resuming: bool, device: torch.device) -> Exposures:
+    """The gains by which the training photos differ where they show the same; a resumed run loads its own."""
+    views = scene.train
+    if resuming:
+        return Exposures.identity(len(views), device)
+    gains = compare_exposures(views, scene.points).gains  # [V, 3] of the channels, in stops
+    exposures, factors = Exposures.identity(len(gains), device), 2.0 ** torch.from_numpy(gains).double()  # [V, 3]
+    exposures.offsets[:, range(3), range(3)] = (factors / factors.mean(dim=0) - 1.0).to(exposures.offsets)
+    return exposures
+
+
+def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
+    """The model that training starts from: a given one, or one of points; and a backdrop if one is wanted.
+
+    If there are more points than `density.max_gaussians` allows, as many as it allows are taken, evenly in their order.
+
+    Args:
+        init: as `train.init`.
+
+    Returns:
+        On the CPU.
+
+    Raises:
+        InputError: the given model cannot be read, or the cap has no room for it or for the backdrop.
+    """
+    train, cap = config.train, cap_of(config)
+    others = BACKDROP_COUNT if train.backdrop else 0
+    if cap and cap <= others:
+        raise InputError(
+            f"density.max_gaussians {cap} leaves no room beside the {others} of the backdrop: allow more, or leave the "
+            "backdrop out by train.backdrop=false"
+        )
+    if init in ("points", "random"):
+        points, colors = scene.points, scene.point_colors
+        if init == "random":
+            cameras = scene.train.cameras
+            viewmats, Ks = cameras.viewmats.cpu().double().numpy(), cameras.Ks.cpu().double().numpy()
+            points = torch.from_numpy(starting_points(viewmats, Ks, cameras.sizes)[0]).float()
+            colors = colors_in_photos(points, scene.train.cameras, scene.train.photos, scene.train.masks)
+        rows = evenly(len(points), cap - others if cap else len(points))
+        settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
+        gaussians = gaussians_from_points(points[rows], colors[rows], *settings)
+    else:
+        gaussians = with_degree(load_given(init, scene, train.init_world), train.sh_degree)
+        if cap and len(gaussians) + others > cap:
+            raise InputError(
+                f"'{init}' has {len(gaussians)} Gaussians, more than density.max_gaussians {cap} allows beside "
+                f"{others} of a backdrop: allow more, or start from points"
+            )
+    if not train.backdrop:
+        return gaussians
+    color = _mean_color(scene.train)
+    backdrop = backdrop_gaussians(color, train.sh_degree, scene.extent)
+    return Gaussians(**{name: torch.cat([tensor, getattr(backdrop, name)]) for name, tensor in gaussians.items()})
+
+
+def _mean_color(views: PosedImages) -> Tensor:
+    """[3] float32, 0 .. 1: the mean of every `COLOR_STRIDE`-th pixel that is not masked; transparent ones on black."""
+    pixels = views.photos.stored[::COLOR_STRIDE, :3].float().cpu()
+    if views.masks is not None:
+        keep = [views.masks.image(view).reshape(-1) for view in range(len(views))]
+        kept = torch.cat(keep)[::COLOR_STRIDE]
+        pixels = pixels[kept] if kept.any() else pixels
+    return pixels.mean(dim=0) / 255.0

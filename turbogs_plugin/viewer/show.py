@@ -63,7 +63,7 @@ def open_state(path: Path, device: torch.device, given: Config | None = None) ->
         InputError: there is no usable model, or no usable capture of a run or where one was named.
     """
     if given is None and not path.is_dir():
-        alone = read_given(path)
+        alone, _ = read_given(path)
         means = alone.means[alone.finite_rows()]
         means = means if len(means) else torch.zeros(1, 3)
         middle = means.median(dim=0).values
