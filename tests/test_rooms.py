@@ -67,8 +67,17 @@ Whoever needs more takes something out, or says in the change which measured gai
 """
 
 STILL_LARGER = {
-    "turbogs_plugin": 25_420,
-    "turbogs_plugin/{types,tiles,masks,error_maps}": 1_270,
+    "turbogs_plugin": 23_480,
+    "turbogs_plugin/{types,tiles,masks,error_maps}": 1_185,
+    "turbogs_plugin/distributed": 1_196,
+    "turbogs_plugin/model": 968,
+    "turbogs_plugin/captures": 2_926,
+    "turbogs_plugin/scene": 1_240,
+    "turbogs_plugin/{config,plan}": 1_503,
+    "turbogs_plugin/train": 2_326,
+    "turbogs_plugin/export": 745,
+    "tests": 24_980,
+}": 1_270,
     "turbogs_plugin/engine": 4_970,
     "turbogs_plugin/distributed": 1_255,
     "turbogs_plugin/model": 1_160,
