@@ -117,8 +117,8 @@ def test_bad_values(capture, tmp_path, file, place, replacement, words):
         (b"property float x", b"property list uchar int x", "not a whole .ply file"),
         (b"property float nx", b"property float f_rest_9", "10 properties f_rest_"),
         (b"property float opacity", b"property float opacities", "lacks the properties opacity"),
-        (b"end_header\n", b"", "it has no header"),
-        (b"ply\n", b"", "not a .ply file"),
+        (b"end_header\n", b"", "not a whole .ply file"),
+        (b"ply\n", b"", "not a whole .ply file"),
     ],
 )
 def test_bad_ply_headers(model_ply, tmp_path, old, new, words):

@@ -218,7 +218,7 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         "other keys": (saved("weights.pt", {"conv1": torch.zeros(3), "bias": torch.zeros(1)}), "bias, conv1"),
         "code": (saved("code.pt", {"splats": Path("x")}), "more than plain tensors"),
         "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
-        "not a ply": (written("text.ply", b"text"), "not a .ply file"),
+        "not a ply": (written("text.ply", b"text"), "not a whole .ply file"),
         "not a spz": (written("text.spz", b"text"), "cannot read"),
     }
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from turbogs_plugin.scene import PosedImages
-from turbogs_plugin.scene.sequence import PhotoOrder
+from turbogs_plugin.scene.sequence import neighbours
 
 POINTS_AT_MOST = 2000
 """3D points examined."""
@@ -111,7 +111,7 @@ def compare_exposures(views: PosedImages, points: Tensor) -> PhotoGains:
     gains = fit_gains(pairs, np.array(list(kept.values()), dtype=np.float64).reshape(-1, 3), weights, count)
     compared = np.bincount(pairs.reshape(-1), minlength=count) > 0  # [V]
     names = [name for name, told in zip(views.names, compared, strict=True) if told]
-    among, near = gains[compared], PhotoOrder(views.names).neighbours(names, names)
+    among, near = gains[compared], neighbours(views.names, names, names)
     rest = among - near.mean(torch.from_numpy(among)).numpy()
     return PhotoGains(gains, compared, _deviation(among), _deviation(rest))
 

@@ -3,8 +3,6 @@ has learnt nothing, so it is refused before its first iteration."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from turbogs_plugin.errors import InputError
@@ -27,34 +25,18 @@ OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes x right, y down, z forward to axes x right, y up, z backward, and back."""
 
 
-class Likeness(NamedTuple):
-    """How much photos are like the points that their cameras see.
-
-    Args:
-        places: number of visible points over all photos.
-        correlation: of their colours with the photos' colours there; NaN where either are all alike.
-    """
-
-    places: int
-    correlation: float
-
-
 def require_agreement(scene: Scene) -> None:
-    """Refuse a scene on which no training can work.
+    """Refuse a scene on which no training can work, by a bounded number of its pixels and points.
 
     Raises:
         InputError: the likely cause and the remedy.
     """
-    cause = contradiction(scene)
-    if cause is not None:
+    if cause := _contradiction(scene):
         raise InputError(f"'{scene.name}': {cause}; scene.force=true trains all the same")
 
 
-def contradiction(scene: Scene) -> str | None:
-    """What in a scene contradicts what else, and the likely remedy; None where nothing does.
-
-    A bounded number of its pixels and points is examined.
-    """
+def _contradiction(scene: Scene) -> str:
+    """The cause and the remedy of `require_agreement`; empty where nothing contradicts."""
     views = scene.train
     lens = float(np.median(views.cameras.Ks[:, 0, 0].cpu().numpy() / views.cameras.sizes[:, 0]))
     if lens < SHORTEST_LENS:
@@ -62,33 +44,34 @@ def contradiction(scene: Scene) -> str | None:
             f"focal lengths are {lens:.2g} of the photos' width, a view of nearly 180 degrees: write focal lengths and "
             "principal points in pixels, not in shares of the photo"
         )
-    if views.photos.transparent and not any(_pixels(views, view_id)[:, 3].any() for view_id in _examined(views)):
+    examined = evenly(len(views), MOST_PHOTOS)
+    if views.photos.transparent and not any(_pixels(views, view_id)[:, 3].any() for view_id in examined):
         return "all photos are transparent everywhere (alpha 0): write them without alpha"
     if scene.drawn_points:
-        return None  # nothing says where the scene is
+        return ""  # nothing says where the scene is
     poses = scene.frame.restore_poses(views.cameras.viewmats.cpu().numpy())  # [V, 4, 4]
-    found = likeness(scene, poses)
-    unlike = found.places >= FEWEST_COLORS and found.correlation < LEAST_LIKENESS
-    if found.places >= FEWEST_PLACES and not unlike:
-        return None
+    places, correlation = likeness(scene, poses)
+    unlike = places >= FEWEST_COLORS and correlation < LEAST_LIKENESS
+    if places >= FEWEST_PLACES and not unlike:
+        return ""
     what = "photos do not show the points where the cameras see them" if unlike else "the cameras see no points"
     for other, remedy in (
         (OTHER_AXES @ poses, "multiply columns 2 and 3 of each camera-to-world matrix by -1 (its axes are others)"),
         (np.linalg.inv(poses), "invert each pose's matrix (camera to world is taken for world to camera)"),
     ):
-        if likeness(scene, other).correlation >= LIKENESS:
+        if likeness(scene, other)[1] >= LIKENESS:
             return f"{what}, and with other poses they do: {remedy}"
     return f"{what}: poses, points and photos must be of one solve and in one frame"
 
 
-def likeness(scene: Scene, poses: np.ndarray) -> Likeness:
-    """Likeness of the scene's training photos and points by other poses [V, 4, 4], world to camera, in the capture's
-    coordinates."""
+def likeness(scene: Scene, poses: np.ndarray) -> tuple[int, float]:
+    """Number of visible points over all training photos, and the correlation of their colours with the photos' colours
+    there; NaN where either are all alike. `poses`: [V, 4, 4] world to camera, in the capture's coordinates."""
     views, rows = scene.train, evenly(len(scene.points), MOST_POINTS)
     points = scene.frame.restore_points(scene.points[rows].double().cpu().numpy())  # [M, 3]
     own = scene.point_colors[rows].cpu().numpy().astype(np.float64)  # [M, 3]
     shown: list[np.ndarray] = []
-    for view_id in _examined(views):
+    for view_id in evenly(len(views), MOST_PHOTOS):
         width, height = views.cameras.sizes[view_id].tolist()
         places = points @ poses[view_id, :3, :3].T + poses[view_id, :3, 3]
         ids = np.flatnonzero(places[:, 2] > 0)
@@ -106,11 +89,7 @@ def likeness(scene: Scene, poses: np.ndarray) -> Likeness:
     first, second = np.concatenate(shown, axis=1)
     with np.errstate(invalid="ignore"):
         correlation = (first * second).sum() / np.sqrt((first**2).sum() * (second**2).sum())
-    return Likeness(len(first), float(correlation))
-
-
-def _examined(views: PosedImages) -> list[int]:
-    return evenly(len(views), MOST_PHOTOS)
+    return len(first), float(correlation)
 
 
 def _pixels(views: PosedImages, view_id: int, step: int | None = None) -> np.ndarray:

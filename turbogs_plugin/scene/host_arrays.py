@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import ctypes
 import math
+import mmap
 import os
-import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,10 +21,6 @@ from turbogs_plugin.errors import InputError
 
 MEMORY_SHARE = 0.5
 """An array takes at most this share of the memory that is free when it is made."""
-DISK_SHARE = 0.95
-"""A file takes at most this share of what is free on its disk."""
-MADV_WILLNEED = 3
-"""Advice of ``madvise(2)`` on Linux: read ahead."""
 LARGE_FILES = Path("/var/tmp")
 """Folder of large temporary files: /tmp often lies in memory."""
 
@@ -45,8 +41,22 @@ def host_array(shape: Sequence[int], dtype: torch.dtype, what: str) -> Tensor:
     size = elements * dtype.itemsize
     if not too_large(size):
         return torch.empty(*shape, dtype=dtype)
-    why = f"{what} take {_gibibytes(size)} of {_gibibytes(free_host_bytes())} of free memory"
-    return _mapped(elements, dtype, size, why).view(*shape)
+    folder = _folder()
+    try:
+        file, name = tempfile.mkstemp(prefix="turbogs-", dir=folder)
+        try:
+            # All of it now: a disk that is full later would end the process without a word.
+            os.posix_fallocate(file, 0, size)
+            return torch.from_file(name, shared=True, size=elements, dtype=dtype).view(*shape)
+        finally:
+            os.close(file)
+            os.unlink(name)
+    except (OSError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:160]
+        raise InputError(
+            f"{what} take {_gibibytes(size)} of {_gibibytes(free_host_bytes())} of free memory, and a file for them "
+            f"cannot be made in {folder} ({reason}): set TMPDIR to a folder with more room, or use a larger --factor"
+        ) from error
 
 
 def too_large(size: int) -> bool:
@@ -67,7 +77,7 @@ def read_ahead(arrays: Sequence[Tensor]) -> None:
             start = array.data_ptr() // page * page
             length = array.data_ptr() + array.nbytes - start
             # Advice: it may fail.
-            ctypes.CDLL(None).madvise(ctypes.c_void_p(start), ctypes.c_size_t(length), MADV_WILLNEED)
+            ctypes.CDLL(None).madvise(ctypes.c_void_p(start), ctypes.c_size_t(length), mmap.MADV_WILLNEED)
 
 
 def file_note(arrays: Sequence[Tensor], what: str) -> str:
@@ -88,25 +98,16 @@ def free_host_bytes() -> int:
 
 
 def _group_rooms() -> list[int]:
-    """Bytes left in each control group with a limit that this process is in; what files keep cached counts as left."""
-    rooms = []
-    for line in _lines(Path("/proc/self/cgroup")):
-        _, controllers, place = line.split(":", 2)
-        if controllers not in ("", "memory"):
-            continue
-        root = Path("/sys/fs/cgroup") / controllers
-        limit, usage, cached = (
-            ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
-            if controllers
-            else ("memory.max", "memory.current", "inactive_file")
-        )
-        inner = root / place.lstrip("/")
-        for group in (inner, *(parent for parent in inner.parents if parent == root or root in parent.parents), root):
-            numbers = [_lines(group / name) for name in (limit, usage)]
-            if not all(lines and lines[0].isdigit() for lines in numbers):
-                continue  # "max", or a group seen from within a container
+    """Bytes left in each control group (version 2) with a limit that this process is in; what files keep cached counts
+    as left."""
+    rooms, root = [], Path("/sys/fs/cgroup")
+    own = next((line[3:] for line in _lines(Path("/proc/self/cgroup")) if line.startswith("0::")), "")
+    inner = root / own.lstrip("/")
+    for group in {inner, *inner.parents, root}:
+        numbers = [_lines(group / name) for name in ("memory.max", "memory.current")]
+        if all(lines and lines[0].isdigit() for lines in numbers):  # not "max", nor a group unseen in a container
             stat = dict(line.split() for line in _lines(group / "memory.stat"))
-            rooms.append(int(numbers[0][0]) - int(numbers[1][0]) + int(stat.get(cached, 0)))
+            rooms.append(int(numbers[0][0]) - int(numbers[1][0]) + int(stat.get("inactive_file", 0)))
     return rooms
 
 
@@ -121,32 +122,6 @@ def _folder() -> str:
     if "TMPDIR" not in os.environ and os.access(LARGE_FILES, os.W_OK):
         return str(LARGE_FILES)
     return tempfile.gettempdir()
-
-
-def _mapped(elements: int, dtype: torch.dtype, size: int, why: str) -> Tensor:
-    """[elements] in a file. `why` it does not lie in memory."""
-    folder = _folder()
-    try:
-        free = shutil.disk_usage(folder).free
-        if size > DISK_SHARE * free:
-            raise InputError(
-                f"{why}, and a file for them does not fit in {folder} with {_gibibytes(free)} free: set TMPDIR to a "
-                "folder with more, or use a larger --factor"
-            )
-        file, name = tempfile.mkstemp(prefix="turbogs-", dir=folder)
-        try:
-            # All of it now: a disk that is full later would end the process without a word.
-            os.posix_fallocate(file, 0, size)
-            return torch.from_file(name, shared=True, size=elements, dtype=dtype)
-        finally:
-            os.close(file)
-            os.unlink(name)
-    except (OSError, RuntimeError) as error:
-        reason = " ".join(str(error).split())[:160]
-        raise InputError(
-            f"{why}, and a file for them cannot be made in {folder} ({reason}): set TMPDIR to another folder, or use a "
-            "larger --factor"
-        ) from error
 
 
 def _gibibytes(size: int) -> str:

@@ -31,7 +31,6 @@ from torch import Tensor
 
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.host_arrays import host_array, in_file, read_ahead
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
@@ -196,11 +195,6 @@ class _Windowed:
         """See `ViewWindow`."""
         return self._window.offsets
 
-    @property
-    def window_bytes(self) -> int:
-        """Memory of the window."""
-        return sum(array.nbytes for array in self._window._arrays)
-
     def fetch(self, view_ids: Sequence[int]) -> None:
         self._window.fetch(view_ids)
 
@@ -273,14 +267,6 @@ def place_views(views: PosedImages, device: torch.device, place: str) -> PosedIm
     if place != "host":
         return views.to(device)
     return replace(views.with_cameras_on(device), photos=OffloadedPhotos(views.photos, device))
-
-
-def place_maps(
-    sizes: np.ndarray, device: torch.device, place: str, beta: float, masks: PixelMasks | None = None
-) -> ErrorMaps:
-    """New maps on the device or, for ``host``, in host memory with a window. Arguments as for `ErrorMaps`. Masks
-    are small, and always on the device."""
-    return (OffloadedErrorMaps if place == "host" else ErrorMaps)(sizes, device, beta=beta, masks=masks)
 
 
 class _CopyStream:

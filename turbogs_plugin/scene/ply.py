@@ -9,8 +9,6 @@ import numpy as np
 
 from turbogs_plugin.errors import InputError
 
-LONGEST_HEADER = 1 << 16
-
 
 class _AsciiLines(io.BufferedReader):
     """A file whose lines are ASCII: trimesh takes header lines for UTF-8, and comments may be in any encoding."""
@@ -29,8 +27,6 @@ def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
     """
     from trimesh.exchange.ply import load_ply  # its import takes a second
 
-    path = Path(path)
-    read_header(path)
     try:
         with _AsciiLines(io.FileIO(path)) as file, np.errstate(all="ignore"):
             vertices = load_ply(file, skip_materials=True)["metadata"]["_ply_raw"]["vertex"]
@@ -40,30 +36,12 @@ def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
             columns = {name: vertices["data"][name].reshape(-1) for name in types}
         if any(column.shape != (count,) or column.dtype.kind not in "iuf" for column in columns.values()):
             raise ValueError("it is cut short, or a property is not a single number")
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     except Exception as error:  # of many kinds, for malformed files
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{path} is not a whole .ply file of vertices ({reason}): copy or export it again") from None
     return columns
-
-
-def read_header(path: Path) -> tuple[list[str], int]:
-    """The lines of a .ply's header but for the first and the last, and the byte at which its body begins.
-
-    Raises:
-        InputError: no such file, or not a .ply.
-    """
-    try:
-        with path.open("rb") as file:
-            head = file.read(LONGEST_HEADER)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    header, separator, _ = head.partition(b"end_header\n")
-    if not separator:
-        header, separator, _ = head.partition(b"end_header\r\n")
-    if not head.startswith(b"ply") or not separator:
-        raise InputError(f"{path} is not a .ply file: it has no header; copy or export it again")
-    # Comments may be in any encoding: this one takes all bytes.
-    return [line.decode("latin-1") for line in header.splitlines()[1:]], len(header) + len(separator)
 
 
 def read_colors(path: Path, vertices: dict[str, np.ndarray]) -> np.ndarray | None:

@@ -31,43 +31,32 @@ class Neighbours:
         return (values[rows] * weights.view(*weights.shape, *[1] * (values.dim() - 1))).sum(dim=1)
 
 
-class PhotoOrder:
-    """The photos of each folder in the order of their names, in which numbers count as numbers.
+def neighbours(names: Iterable[str], known: Sequence[str], photos: Sequence[str]) -> Neighbours:
+    """The nearest known photos before and after each photo; none is its own neighbour.
 
     The photos of one folder are taken for one sequence: cameras, and programs that cut videos, number what they write.
 
     Args:
-        names: of all photos, with their folders.
+        names: of all photos, with their folders. Their order is by folder, and numbers in them count as numbers.
+        known: names of the photos of which something is known.
+        photos: names of those whose neighbours are wanted.
     """
-
-    def __init__(self, names: Iterable[str]) -> None:
-        ordered = sorted(set(names), key=_key)
-        self._places = {name: place for place, name in enumerate(ordered)}
-        self._folders = np.unique([_folder(name) for name in ordered], return_inverse=True)[1]  # of each place
-
-    def neighbours(self, known: Sequence[str], photos: Sequence[str]) -> Neighbours:
-        """The nearest known photos before and after each photo; none is its own neighbour.
-
-        Args:
-            known: names of the photos of which something is known.
-            photos: names of those whose neighbours are wanted.
-        """
-        there, here = self._places_of(known), self._places_of(photos)[:, None]  # [known], [W, 1]
-        order = there.argsort()
-        there = there[order]
-        before = np.searchsorted(there, here - 1, side="right") - 1
-        found = np.concatenate([before, np.searchsorted(there, here + 1)], axis=1)  # [W, 2]
-        inside: NDArray[np.bool_] = np.logical_and(found >= 0, found < len(there))
-        there, order, found[~inside] = np.append(there, 0), np.append(order, 0), -1  # -1: the one appended
-        inside &= self._folders[there[found]] == self._folders[here]
-        lengths = np.where(inside, np.abs(there[found] - here), 0)
-        both = np.asarray(inside.all(axis=1, keepdims=True))
-        weights = np.where(both, lengths[:, ::-1] / np.maximum(1, lengths.sum(axis=1, keepdims=True)), inside)
-        rows = np.where(inside, order[found], 0)
-        return Neighbours(torch.from_numpy(rows), torch.from_numpy(weights).float())
-
-    def _places_of(self, names: Sequence[str]) -> NDArray[np.int64]:
-        return np.array([self._places[name] for name in names], dtype=np.int64)
+    ordered = sorted(set(names), key=_key)
+    places = {name: place for place, name in enumerate(ordered)}
+    folders = np.unique([_folder(name) for name in ordered], return_inverse=True)[1]  # of each place
+    there, here = (np.array([places[name] for name in group], dtype=np.int64) for group in (known, photos))
+    order, here = there.argsort(), here[:, None]  # [known], [W, 1]
+    there = there[order]
+    before = np.searchsorted(there, here - 1, side="right") - 1
+    found = np.concatenate([before, np.searchsorted(there, here + 1)], axis=1)  # [W, 2]
+    inside: NDArray[np.bool_] = np.logical_and(found >= 0, found < len(there))
+    there, order, found[~inside] = np.append(there, 0), np.append(order, 0), -1  # -1: the one appended
+    inside &= folders[there[found]] == folders[here]
+    lengths = np.where(inside, np.abs(there[found] - here), 0)
+    both = np.asarray(inside.all(axis=1, keepdims=True))
+    weights = np.where(both, lengths[:, ::-1] / np.maximum(1, lengths.sum(axis=1, keepdims=True)), inside)
+    rows = np.where(inside, order[found], 0)
+    return Neighbours(torch.from_numpy(rows), torch.from_numpy(weights).float())
 
 
 def _folder(name: str) -> str:

@@ -17,7 +17,7 @@ from torch import Tensor
 from turbogs_plugin.config.sections import parse_color
 from turbogs_plugin.engine.reference.philox import PURPOSE_BACKGROUND, host_words
 from turbogs_plugin.engine.render_pass import RasterSettings
-from turbogs_plugin.scene.sequence import Neighbours, PhotoOrder
+from turbogs_plugin.scene.sequence import Neighbours, neighbours
 from turbogs_plugin.types import BLACK, WHITE, Color, Step
 
 
@@ -100,8 +100,8 @@ def interpolated_exposures(offsets: Tensor, trained: Sequence[str], photos: Sequ
         trained: [V] the training photos' names.
         photos: [W] names; a training photo gets its neighbours' exposure, not its own.
     """
-    order = PhotoOrder([*trained, *photos])
-    return order.neighbours(trained, photos).mean(offsets) * _slope(offsets, order.neighbours(trained, trained))
+    names = [*trained, *photos]
+    return neighbours(names, trained, photos).mean(offsets) * _slope(offsets, neighbours(names, trained, trained))
 
 
 def _slope(offsets: Tensor, among: Neighbours) -> float:

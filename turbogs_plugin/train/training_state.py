@@ -17,6 +17,7 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine
 from turbogs_plugin.engine.exposures import Exposures, expose
 from turbogs_plugin.engine.render import dense_samples, rasterize
+from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.gsplat_file import read_gsplat
 from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points, with_degree
@@ -24,7 +25,7 @@ from turbogs_plugin.plan.memory import cap_of
 from turbogs_plugin.plan.photo_gains import compare_exposures
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.geometry import evenly
-from turbogs_plugin.scene.offload import place_maps, place_views
+from turbogs_plugin.scene.offload import OffloadedErrorMaps, place_views
 from turbogs_plugin.train.look import Background, Look, interpolated_exposures
 from turbogs_plugin.train.parameter_mean import ParameterMean
 from turbogs_plugin.train.saved_model import load_given
@@ -58,7 +59,8 @@ class TrainingState:
         train = config.train
         self.config, self.engine, self.extent = config, engine, scene.extent
         self.views = place_views(scene.train, device, train.pixels_place)
-        self.maps = place_maps(self.views.cameras.sizes, device, train.pixels_place, config.maps.beta, self.views.masks)
+        kind = OffloadedErrorMaps if train.pixels_place == "host" else ErrorMaps
+        self.maps: ErrorMaps = kind(scene.train.cameras.sizes, device, config.maps.beta, masks=self.views.masks)
         self.background = Background.of(train.background, self.views.photos.transparent)
         self.exposures = first_exposures(scene, resuming, device) if train.exposure else None
         self.view_sampler = config.build("view_sampler")
