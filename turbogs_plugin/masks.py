@@ -23,41 +23,6 @@ WORDS = TILE_PIXELS // WORD_BITS
 """32-bit words of a tile's bits; bit n of word j is the pixel with `sample_order` 32 j + n."""
 
 
-@dataclass(frozen=True, eq=False)
-class ViewMask:
-    """The live tiles of one view.
-
-    Args:
-        size: (width, height).
-        tiles: [L] int32, number of each live tile within the view, ascending.
-        cut: [L] bool, the mask takes pixels of the tile.
-        bits: [C, WORDS] int32, the bits of the C tiles that are cut.
-        pixels: number of pixels that are not masked.
-    """
-
-    size: tuple[int, int]
-    tiles: np.ndarray
-    cut: np.ndarray
-    bits: np.ndarray
-    pixels: int
-
-    @classmethod
-    def of(cls, keep: np.ndarray) -> ViewMask:
-        """The mask of an image [H, W], in which True or nonzero pixels count."""
-        height, width = keep.shape
-        rows, columns = -(-height // TILE_SIZE), -(-width // TILE_SIZE)
-        padded = np.zeros((rows * TILE_SIZE, columns * TILE_SIZE), dtype=bool)
-        padded[:height, :width] = keep
-        places = padded.reshape(rows, TILE_SIZE, columns, TILE_SIZE).swapaxes(1, 2).reshape(-1, TILE_PIXELS)
-        counts = places.sum(axis=1)
-        live = np.flatnonzero(counts)
-        widths, heights = tile_extents(np.array([[width, height]]))
-        cut = counts[live] < (widths * heights)[live]
-        packed = np.packbits(places[live[cut]][:, _PLACES], axis=1, bitorder="little")  # [C, 32] bytes
-        bits = np.ascontiguousarray(packed).reshape(-1).view("<i4").astype(np.int32).reshape(-1, WORDS)
-        return cls((width, height), live.astype(np.int32), cut, bits, int(counts.sum()))
-
-
 _PLACES = pixel_table(np.full((1, 2), TILE_SIZE), "cpu")[0].numpy()
 """[256] int32: the pixel, counted row by row, that each place of a tile in `sample_order` has."""
 
@@ -83,18 +48,38 @@ class PixelMasks:
     bits: Tensor
 
     @classmethod
-    def of_views(cls, views: Sequence[ViewMask]) -> PixelMasks:
-        """The masks of these views, on the CPU."""
-        cut = np.concatenate([view.cut for view in views])
-        rows = np.where(cut, np.cumsum(cut), 0).astype(np.int32)
-        bits = np.concatenate([np.full((1, WORDS), -1, dtype=np.int32), *(view.bits for view in views)])
+    def of(cls, keep: np.ndarray) -> PixelMasks:
+        """The mask of one view, an image [H, W] in which True or nonzero pixels count; on the CPU."""
+        height, width = keep.shape
+        rows, columns = -(-height // TILE_SIZE), -(-width // TILE_SIZE)
+        padded = np.zeros((rows * TILE_SIZE, columns * TILE_SIZE), dtype=bool)
+        padded[:height, :width] = keep
+        places = padded.reshape(rows, TILE_SIZE, columns, TILE_SIZE).swapaxes(1, 2).reshape(-1, TILE_PIXELS)
+        counts, sizes = places.sum(axis=1), np.array([[width, height]], dtype=np.int64)
+        live = np.flatnonzero(counts)
+        cut = counts[live] < np.multiply(*tile_extents(sizes))[live]  # [L] bool, the mask takes pixels of the tile
+        packed = np.ascontiguousarray(np.packbits(places[live[cut]][:, _PLACES], axis=1, bitorder="little"))
         return cls(
-            sizes=np.array([view.size for view in views], dtype=np.int64).reshape(-1, 2),
-            offsets=np.concatenate([[0], np.cumsum([len(view.tiles) for view in views])]).astype(np.int64),
-            pixel_counts=np.array([view.pixels for view in views], dtype=np.int64),
-            tiles=torch.from_numpy(np.concatenate([view.tiles for view in views])),
-            rows=torch.from_numpy(rows),
-            bits=torch.from_numpy(bits),
+            sizes=sizes,
+            offsets=np.array([0, len(live)]),
+            pixel_counts=counts.sum(keepdims=True),
+            tiles=torch.from_numpy(live.astype(np.int32)),
+            rows=torch.from_numpy(np.where(cut, np.cumsum(cut), 0).astype(np.int32)),
+            bits=torch.from_numpy(np.concatenate([np.full((1, WORDS), -1, dtype=np.int32), packed.view("<i4")])),
+        )
+
+    @classmethod
+    def joined(cls, views: Sequence[PixelMasks]) -> PixelMasks:
+        """The masks of single views as the masks of all."""
+        befores = np.cumsum([0, *(len(view.bits) - 1 for view in views)]).tolist()  # rows of cut tiles
+        rows = [torch.where(view.rows > 0, view.rows + before, 0) for view, before in zip(views, befores, strict=False)]
+        return cls(
+            sizes=np.concatenate([view.sizes for view in views]),
+            offsets=np.cumsum([0, *(len(view.tiles) for view in views)]),
+            pixel_counts=np.concatenate([view.pixel_counts for view in views]),
+            tiles=torch.cat([view.tiles for view in views]),
+            rows=torch.cat(rows),
+            bits=torch.cat([views[0].bits[:1], *(view.bits[1:] for view in views)]),
         )
 
     @classmethod
@@ -110,7 +95,7 @@ class PixelMasks:
         if len(masks) == 0 or any(getattr(mask, "ndim", 0) != 2 for mask in masks):
             shapes = [tuple(getattr(mask, "shape", ())) for mask in masks][:4]
             raise InputError(f"masks have shapes {shapes}: expected [H, W] for each view, True where a pixel counts")
-        return cls.of_views([ViewMask.of(torch.as_tensor(mask).cpu().numpy() != 0) for mask in masks])
+        return cls.joined([cls.of(torch.as_tensor(mask).cpu().numpy() != 0) for mask in masks])
 
     def to(self, device: torch.device | str) -> PixelMasks:
         tensors = {name: getattr(self, name).to(device) for name in ("tiles", "rows", "bits")}

@@ -122,13 +122,11 @@ def compact(
 
 def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.device | str) -> PixelSamples:
     """Every pixel of these views, in the order of samples. `sizes`: [K, 2] int64 (width, height)."""
-    device = torch.device(device)
-    pixel_ids = [_dense_view(int(width), int(height), device) for width, height in sizes]
-    offsets = _dense_offsets(np.ascontiguousarray(sizes, dtype=np.int64).tobytes(), device)
+    pixel_ids, offsets = _dense(np.ascontiguousarray(sizes, dtype=np.int64).tobytes(), torch.device(device))
     return PixelSamples(
         view_ids=tuple(view_ids),
         sizes=sizes,
-        pixel_ids=torch.cat(pixel_ids),
+        pixel_ids=pixel_ids,
         tile_ids=torch.arange(len(offsets) - 1, dtype=torch.int32, device=device),
         tile_offsets=offsets,
         has_empty_slots=False,
@@ -136,16 +134,11 @@ def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.devic
     )
 
 
-@lru_cache(maxsize=32)
-def _dense_offsets(sizes_bytes: bytes, device: torch.device) -> Tensor:
-    """[T + 1] int32: first slot of each tile of dense views; `sizes_bytes` are the bytes of the [K, 2] int64 sizes. The
-    result is kept, as sending it anew would make every iteration of a dense trainer wait for the device."""
-    widths, heights = tile_extents(np.frombuffer(sizes_bytes, dtype=np.int64).reshape(-1, 2))
-    return torch.as_tensor(np.concatenate([[0], np.cumsum(widths * heights)]), dtype=torch.int32, device=device)
-
-
-@lru_cache(maxsize=32)
-def _dense_view(width: int, height: int, device: torch.device) -> Tensor:
-    """[H * W] int32: the pixels of one image in the order of samples. Kept, as evaluations ask for it again."""
-    table = pixel_table(np.array([[width, height]]), device)
-    return table[table >= 0]
+@lru_cache(maxsize=16)
+def _dense(sizes_bytes: bytes, device: torch.device) -> tuple[Tensor, Tensor]:
+    """[P] int32 pixel ids and [T + 1] int32 first slots of each tile of dense views, whose [K, 2] int64 sizes are these
+    bytes. Kept, as making them anew would let every iteration of a dense trainer wait for the device."""
+    sizes = np.frombuffer(sizes_bytes, dtype=np.int64).reshape(-1, 2)
+    table, slots = pixel_table(sizes, device), np.multiply(*tile_extents(sizes))
+    offsets = torch.as_tensor(np.concatenate([[0], np.cumsum(slots)]), dtype=torch.int32, device=device)
+    return table[table >= 0], offsets

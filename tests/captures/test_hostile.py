@@ -14,7 +14,7 @@ from helpers.framework_runs import thin_out_points
 from turbogs_plugin.captures import write_demo_capture
 from turbogs_plugin.captures.colmap import read_colmap
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.ply import load_ply, save_ply
+from turbogs_plugin.model.ply import read_ply, save_ply
 from turbogs_plugin.types import Gaussians
 
 NAN, INF, HUGE = struct.pack("<d", np.nan), struct.pack("<d", np.inf), struct.pack("<Q", 2**60)
@@ -126,7 +126,7 @@ def test_bad_ply_headers(model_ply, tmp_path, old, new, words):
     content = model_ply.read_bytes()
     assert old in content
     target.write_bytes(content.replace(old, new, 1))
-    error = outcome_within(MEMORY, load_ply, target)
+    error = outcome_within(MEMORY, read_ply, target)
     assert isinstance(error, InputError)
     with pytest.raises(InputError, match=words):
         raise error

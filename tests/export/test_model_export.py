@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.models import load_ply
 
 from turbogs_plugin.commands.options import GivenOptions
 from turbogs_plugin.engine.render import render_image
@@ -15,7 +16,6 @@ from turbogs_plugin.export import film
 from turbogs_plugin.export.model_export import contributions, mean_psnr, pruned
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.model.formats import FORMATS
-from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.types import BLACK, SH_C0, WHITE

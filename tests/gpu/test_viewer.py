@@ -23,15 +23,6 @@ pytestmark = [
 CUDA, CPU = torch.device("cuda"), torch.device("cpu")
 
 
-class Watcher:
-    """Keeps what a training tells."""
-
-    samples = None
-
-    def sampled(self, samples) -> None:
-        self.samples = samples
-
-
 @pytest.fixture(scope="module", params=["device", "host"])
 def subjects(request, tmp_path_factory) -> tuple[ModelState, ModelState]:
     """A model at the end of its densification on a GPU, and the same with everything on the CPU."""
@@ -41,12 +32,13 @@ def subjects(request, tmp_path_factory) -> tuple[ModelState, ModelState]:
     scene = load_scene(capture)
     loop = new_loop(make_plan(config, scene, CUDA).apply(config), scene, CUDA)
     trainer = loop.trainer
-    trainer.observer = watcher = Watcher()
+    latest = []
+    trainer.on_samples = lambda samples: latest.__setitem__(slice(None), [samples])
     loop.run()
     synchronize(CUDA)
     views = CaptureViews(trainer.views, place_views(scene.test, CUDA, request.param))
     look = Look(trainer.sh_degree, DEFAULT_SETTINGS)
-    here = ModelState(trainer.gaussians, look, views, (trainer.maps, trainer.now), watcher.samples)
+    here = ModelState(trainer.gaussians, look, views, (trainer.maps, trainer.now), latest[0])
     return here, ModelState(trainer.gaussians.map(torch.Tensor.cpu), look, CaptureViews(*split(scene)))
 
 

@@ -41,17 +41,6 @@ def test_coincident_points_get_a_scale():
     assert same.scales.exp().flatten().tolist() == pytest.approx([2e-4] * 15) and same.shN.shape == (5, 0, 3)
 
 
-def test_points_that_are_not_finite_are_left_out_and_counted():
-    points = torch.rand(6, 3)
-    points[1, 2], points[4, 0] = torch.nan, torch.inf
-    colors = torch.arange(18, dtype=torch.uint8).view(6, 3)
-    with pytest.warns(UserWarning, match="2 of 6 points are not finite"):
-        gaussians = gaussians_from_points(points, colors, sh_degree=0, extent=1.0)
-    assert torch.equal(gaussians.means, points[[0, 2, 3, 5]])
-    expected = gaussians_from_points(points[[0, 2, 3, 5]], colors[[0, 2, 3, 5]], sh_degree=0, extent=1.0)
-    assert torch.equal(gaussians.sh0, expected.sh0) and torch.equal(gaussians.scales, expected.scales)
-
-
 def test_no_points_are_refused():
     with pytest.raises(InputError, match="too few points"):
         gaussians_from_points(torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.uint8), 3, 1.0)

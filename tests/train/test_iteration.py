@@ -92,7 +92,7 @@ def test_iterations_before_a_change_of_the_set_are_not_made_again(scene):
 def test_lost_iterations_are_made_again(scene):
     trainer, seen = make_trainer(scene), []
     trainer.initialise_maps()
-    trainer.observer = SimpleNamespace(sampled=lambda _: seen.append(trainer.iteration), changing=lambda *change: None)
+    trainer.on_samples = lambda _: seen.append(trainer.iteration)
     trainer.refine = lambda step: None  # no change of the set, before which none is made again
     settle, lost = trainer.engine.settle, {5: 3, 6: 1}
     trainer.engine.settle = lambda wait: lost.pop(trainer.iteration, 0) or settle(wait)

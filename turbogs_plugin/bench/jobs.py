@@ -18,8 +18,8 @@ from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable, write_text_atomically
-from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.report.provenance import missing_bytecode, provenance
+from turbogs_plugin.train.saved_model import load_given
 
 LINES = {"step": step_lines, "raster": raster_lines, "wall": wall_lines}
 
@@ -44,7 +44,7 @@ def time_engine(
     """
     capture = load_scene(scene, load_config("turbogs", overrides).scene.factor)
     capture = replace(capture, train=capture.train.to(device))
-    loaded = load_ply(ply, capture.frame).map(lambda value: value.to(device))
+    loaded = load_given(ply, capture).map(lambda value: value.to(device))
     models = (resized(loaded, size) for size in sizes)
     if what == "step":
         return {"model": ply.name, **bench_step(capture, models, views, repeats, overrides)}

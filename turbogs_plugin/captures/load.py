@@ -19,7 +19,7 @@ from turbogs_plugin.captures.photo_files import IMAGES
 from turbogs_plugin.captures.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.captures.undistort import undistortion_note
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.masks import PixelMasks, ViewMask
+from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.geometry import camera_centers
 from turbogs_plugin.scene.host_arrays import file_note
@@ -84,7 +84,7 @@ def load_scene(
     files = _find_photos(scene, capture, factor)
     mask_files, mask_note = find_masks(scene, capture, files.paths)
     masks = load_masks(mask_files, files.paths, capture, files.file_sizes, files.sizes)
-    seen = np.array([mask is None or mask.pixels > 0 for mask in masks])
+    seen = np.array([mask is None or mask.pixel_counts[0] > 0 for mask in masks])
     parts = [np.flatnonzero(part & seen) for part in (~test, test)]
     for name, part, views in zip(("training", "test"), (~test, test), parts, strict=True):
         if not len(views):
@@ -141,7 +141,7 @@ def _posed(
     capture: Capture,
     viewmats: Tensor,
     sizes: np.ndarray,
-    masks: list[ViewMask | None],
+    masks: list[PixelMasks | None],
     views: np.ndarray,
     photos: Photos,
 ) -> PosedImages:
@@ -154,7 +154,7 @@ def _posed(
     own, masked = [masks[view] for view in views], None
     if any(mask is not None for mask in own):
         pairs = zip(own, sizes[views, ::-1].tolist(), strict=True)  # (height, width)
-        masked = PixelMasks.of_views([mask or ViewMask.of(np.ones(size, dtype=bool)) for mask, size in pairs])
+        masked = PixelMasks.joined([mask or PixelMasks.of(np.ones(size, dtype=bool)) for mask, size in pairs])
     return PosedImages(cameras, tuple(capture.names[view] for view in views), photos, masked, shown)
 
 
@@ -195,9 +195,9 @@ def _normalised(scene: Path, capture: Capture, test: np.ndarray) -> tuple[Frame,
     return frame, viewmats, points
 
 
-def _masked_note(names: tuple[str, ...], masks: list[ViewMask | None], sizes: np.ndarray, seen: np.ndarray) -> str:
+def _masked_note(names: tuple[str, ...], masks: list[PixelMasks | None], sizes: np.ndarray, seen: np.ndarray) -> str:
     """One line on masked pixels and on views left out for them; empty where nothing is masked."""
-    pixels = {view: mask.pixels for view, mask in enumerate(masks) if mask is not None}
+    pixels = {view: int(mask.pixel_counts[0]) for view, mask in enumerate(masks) if mask is not None}
     if not pixels:
         return ""
     share = 1.0 - sum(pixels.values()) / int(sizes[list(pixels)].prod(axis=1).sum())

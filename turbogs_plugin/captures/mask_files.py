@@ -18,7 +18,7 @@ from turbogs_plugin.captures.decoding import OPAQUE_SUFFIXES, decoding_threads, 
 from turbogs_plugin.captures.photo_files import MASKS, find_photos
 from turbogs_plugin.captures.undistort import Lens
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.masks import ViewMask
+from turbogs_plugin.masks import PixelMasks
 
 FOLDER = "masks"
 CONVENTIONS = "NAME.png, NAME.EXTENSION.png or NAME.jpg"
@@ -67,7 +67,7 @@ def in_folders(folders: Sequence[Path], photo: str) -> Path | None:
 
 def load_masks(
     files: Sequence[Path | None], photos: Sequence[Path], capture: Capture, sizes: np.ndarray, targets: np.ndarray
-) -> list[ViewMask | None]:
+) -> list[PixelMasks | None]:
     """Read masks in parallel, undistorted and reduced as the photos are.
 
     Args:
@@ -85,7 +85,7 @@ def load_masks(
     """
     full_sizes = capture.photo_sizes
 
-    def load(view: int) -> ViewMask | None:
+    def load(view: int) -> PixelMasks | None:
         size, target = tuple(sizes[view].tolist()), tuple(targets[view].tolist())
         keep = np.ones(size[::-1], dtype=bool)
         if (file := files[view]) is not None:
@@ -94,7 +94,7 @@ def load_masks(
             with opened_image(photos[view]) as image:
                 if is_transparent(image):
                     keep &= np.asarray(image.convert("RGBA").getchannel("A")) > 0
-        return None if keep.all() else ViewMask.of(_placed(keep, capture.lenses[view], target))
+        return None if keep.all() else PixelMasks.of(_placed(keep, capture.lenses[view], target))
 
     with decoding_threads() as pool:
         return list(pool.map(load, range(len(photos))))

@@ -55,17 +55,6 @@ LAG = 4
 """Passes after which all processes look at the flags of a pass, and wait for them if need be: so all know of them at
 one place, and no host runs farther ahead of its GPU."""
 
-OWNERS_FROM = 4_000_000
-"""Rows of a batch, views times Gaussians, from which on two processes that send messages gain by owners of rows.
-Measured with .45, 1.5, 1.8 and 6 million: below, two exchanges more cost what they save. In place there is one barrier
-more, and owners always gain."""
-
-
-def owners_pay(processes: int, views: int, gaussians: int) -> bool:
-    """Whether owners of rows should make the steps of a batch that is sent as messages. Where they should not, both
-    processes get all records and make all steps."""
-    return processes > 2 or views * gaussians >= OWNERS_FROM
-
 
 class RanksEngine:
     """`Engine` of several processes, as the module says.
@@ -99,11 +88,6 @@ class RanksEngine:
     @property
     def overflow(self) -> Tensor | None:
         return self.engine.overflow
-
-    @property
-    def way(self) -> str:
-        """How colours and records went in the latest pass."""
-        return "messages" if self._exchange is self.messages else "in place"
 
     def place(self, gaussians: Gaussians) -> Gaussians:
         self._owned = None
@@ -157,10 +141,6 @@ class RanksEngine:
         if not isinstance(screen, SharedScreen):
             raise TypeError(f"gradients of {type(screen).__name__} are not of a pass of several processes")
         if self._owned is None:
-            views = len(screen.batch.samples.view_ids)
-            if self._exchange is self.messages and not owners_pay(self.ranks.count, views, len(gaussians)):
-                self.engine.update(rule, screen.whole(), gaussians, moments, stats)
-                return
             self._skipped = moments.skipped.clone()
         if self._owned is None or not all(map(is_, self._owned.whole, (gaussians, moments, stats))):
             self._owned = OwnedRows(self.ranks, gaussians, moments, stats, self.memory.others(gaussians))

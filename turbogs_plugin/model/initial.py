@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import replace
 
 import torch
@@ -34,7 +33,7 @@ def gaussians_from_points(
     become `DARKEST`. The higher bands are zero.
 
     Args:
-        points: [M, 3] float. Points that are not finite are left out, with a warning that counts them.
+        points: [M, 3] float, finite.
         colors: [M, 3] uint8.
         sh_degree: highest degree to allocate, 0 .. 3.
         extent: the scene's, in the points' unit; gives the smallest scale where points coincide.
@@ -42,12 +41,8 @@ def gaussians_from_points(
         size: factor of the scales.
 
     Raises:
-        InputError: fewer than two finite points.
+        InputError: fewer than two points.
     """
-    finite = points.isfinite().all(dim=1)
-    if not finite.all():
-        warnings.warn(f"{int((~finite).sum())} of {len(points)} points are not finite and left out", stacklevel=2)
-        points, colors = points[finite], colors[finite]
     count = len(points)
     if count < 2:
         raise InputError(f"there are too few points to start from: {count}")

@@ -11,7 +11,7 @@ import torch
 from turbogs_plugin.errors import InputError, refusal
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.model.gsplat_file import BANDS
-from turbogs_plugin.model.similarity import Similarity, in_capture, placed, rounding
+from turbogs_plugin.model.similarity import in_capture, rounding
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.ply import read_vertices
 from turbogs_plugin.types import Gaussians
@@ -60,24 +60,15 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
         raise InputError(f"cannot write {path}: {refusal(error)}") from error
 
 
-def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
+def read_ply(path: str | Path) -> Gaussians:
     """Read a model from a .ply with the properties of 3DGS; others are ignored.
 
-    Args:
-        path: the file. Gaussians that are not finite are left out, with a warning that counts them.
-        frame: if given, the model is converted from the capture's own coordinates into this frame.
-
     Returns:
-        float32, on the CPU.
+        float64, on the CPU, in the file's own coordinates; rows may be not finite.
 
     Raises:
-        InputError: the file is not such a .ply, lacks a property, or has no finite Gaussian.
+        InputError: the file is not such a .ply, lacks a property, or has no Gaussian.
     """
-    return placed(read_ply(path), Similarity.into(frame or Frame(np.zeros(3), 1.0)), path)
-
-
-def read_ply(path: str | Path) -> Gaussians:
-    """`load_ply` in the file's own coordinates and in float64; rows may be not finite."""
     path = Path(path)
     vertices = read_vertices(path)
     rest = sum(name.startswith("f_rest_") for name in vertices)

@@ -40,12 +40,9 @@ def read_plain(path: Path, name: str, remedy: str = "") -> Any:
     except OSError as error:
         raise InputError(f"cannot read {name}: {error.strerror or error}") from None
     except Exception as error:  # torch and zipfile raise a dozen kinds for malformed files
-        if isinstance(error, zipfile.BadZipFile):
-            reason = "it is not a whole file of torch.save"
-        elif "weights only" in str(error).lower().replace("_", " "):
+        reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
+        if "weights only" in str(error).lower().replace("_", " "):
             reason = "it holds more than plain tensors and values"
-        else:
-            reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
         raise InputError(f"{name} cannot be used: {reason}{remedy}") from None
 
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import read_text, write_text_atomically
+from turbogs_plugin.files import read_text
 
 
 class WallClock:
@@ -51,10 +51,6 @@ class WallRecord:
     train_seconds: float
     wall_seconds: float | None = None
     parts: dict[str, float] = field(default_factory=dict)
-
-    def write(self, path: Path) -> None:
-        """Write the file."""
-        write_text_atomically(path, json.dumps(asdict(self), indent=1) + "\n")
 
     @staticmethod
     def read(path: Path) -> WallRecord | None:

@@ -197,7 +197,4 @@ def read_given(path: str | Path) -> tuple[Gaussians, Similarity | None]:
 def _own_viewmats(scene: Scene) -> np.ndarray:
     """[V, 4, 4] float64 world to camera of all views, in the capture's own coordinates."""
     both = (scene.train.cameras.viewmats, scene.test.cameras.viewmats)
-    viewmats = torch.cat([part.cpu() for part in both]).double().numpy()
-    frame = scene.frame
-    viewmats[:, :3, 3] = viewmats[:, :3, 3] * frame.scale - viewmats[:, :3, :3] @ frame.center
-    return viewmats
+    return scene.frame.restore_poses(torch.cat([part.cpu() for part in both]).numpy())

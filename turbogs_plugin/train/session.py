@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
@@ -106,7 +109,7 @@ class RunSession(Listener):
             self.wall = WallRecord(loop.clock.seconds, seconds, self.clock.parts)
             if loop.finished and report is not None:
                 report(self)
-            self.wall.write(self.folder.wall)
+            write_text_atomically(self.folder.wall, json.dumps(asdict(self.wall), indent=1) + "\n")
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
         except InputError as error:  # in an iteration: from a strategy of one's own, say

@@ -6,9 +6,8 @@ The state that iterations change is in `turbogs_plugin.train.training_state`, th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -31,13 +30,6 @@ DROPOUT_UNTIL = 0.95
 """Share of a run after which no Gaussian is left out any more, so that the model is fitted as it is drawn."""
 
 
-class IterationObserver(Protocol):
-    """Is told what an iteration does that is stored nowhere else. It must change nothing, and be cheap."""
-
-    def sampled(self, samples: PixelSamples) -> None:
-        """These pixels were sampled."""
-
-
 class Trainer(TrainingState):
     """The iterations of one run.
 
@@ -49,7 +41,7 @@ class Trainer(TrainingState):
         engine: does the computation; None: this device's (`engine_of`).
 
     Attributes:
-        observer: who is told of each iteration, if anybody.
+        on_samples: called with the samples of each iteration, if anything; it must be cheap, and change nothing.
     """
 
     def __init__(
@@ -69,7 +61,7 @@ class Trainer(TrainingState):
         self.clearance: Clearance | None = None
         if config.train.camera_clearance and not scene.drawn_points:
             self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)
-        self.observer: IterationObserver | None = None
+        self.on_samples: Callable[[PixelSamples], None] | None = None
 
     def step(self) -> None:
         """One iteration, in the paper's order."""
@@ -89,8 +81,8 @@ class Trainer(TrainingState):
         require_samples(samples, view_ids, self.config.pixel_sampler["type"])
         if self.maps.masks is not None and not self.pixel_sampler.heeds_masks:
             samples = self.maps.masks.strip(samples)
-        if self.observer is not None:
-            self.observer.sampled(samples)
+        if self.on_samples is not None:
+            self.on_samples(samples)
 
         # 4) Ground truth at the samples
         background = self.background.at(step)

@@ -38,7 +38,7 @@ class LiveViewer(Listener):
         """Take a run that is about to begin; itself, as a listener of its loop. The page's address is printed."""
         print(f"viewer  {self.page.url}", file=sys.stderr, flush=True)
         self.trainer = session.trainer
-        self.trainer.observer = self
+        self.trainer.on_samples = self.sampled
         self._capture = CaptureViews(self.trainer.views, session.test)
         self.page.show_capture(self._capture)
         return self
