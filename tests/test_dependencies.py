@@ -200,13 +200,13 @@ def test_the_core_changes_no_package_of_a_host(host, project):
 
 
 def test_an_extra_is_the_one_that_its_message_names(project):
-    from turbogs_plugin.export import film
+    from turbogs_plugin.export import renders
     from turbogs_plugin.report import tensorboard
     from turbogs_plugin.viewer import server
 
     extras = {
         "viewer": ("viser", server),
-        "video": ("imageio-ffmpeg", film),
+        "video": ("imageio-ffmpeg", renders),
         "tensorboard": ("tensorboard", tensorboard),
     }
     for extra, (package, module) in extras.items():

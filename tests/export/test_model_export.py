@@ -12,13 +12,10 @@ from helpers.models import load_ply
 
 from turbogs_plugin.commands.options import GivenOptions
 from turbogs_plugin.engine.render import render_image
-from turbogs_plugin.export import film
-from turbogs_plugin.export.model_export import contributions, mean_psnr, pruned
-from turbogs_plugin.masks import PixelMasks
+from turbogs_plugin.export import renders
+from turbogs_plugin.export.model_export import contributions, pruned
 from turbogs_plugin.model.formats import FORMATS
-from turbogs_plugin.scene.photos import Photos
-from turbogs_plugin.train.metrics import evaluate
-from turbogs_plugin.types import BLACK, SH_C0, WHITE
+from turbogs_plugin.types import SH_C0, WHITE
 
 
 def refused(result: tuple[int, str, str], *words: object) -> None:
@@ -36,27 +33,6 @@ def test_an_export_says_bytes_and_what_was_lost(turbogs, finished, tmp_path, nam
     assert f"{held:,} bytes in float32 -> {file.stat().st_size:,} bytes in the file" in out
     before, after = map(float, re.search(r"PSNR   ([\d.]+) -> ([\d.]+) dB on 1 of 1 test views", out).groups())
     assert abs(before - after) < (0.005 if name in ("ply", "pt") else 1)
-
-
-@pytest.mark.parametrize("transparent", [False, True])
-def test_a_model_is_measured_as_an_evaluation_does(model, scene, transparent):
-    """On the run's background, without masked pixels."""
-    views = scene.train
-    if transparent:
-        photos = views.photos
-        alpha = torch.arange(len(photos.colors)).remainder(256).to(torch.uint8)[:, None]
-        colors = torch.cat([torch.minimum(photos.colors, alpha), alpha], dim=1)
-        views = replace(views, photos=Photos(colors, photos.sizes))
-    keep = [torch.arange(40)[:, None] + torch.arange(48) > 30 for _ in views.names]
-    views = replace(views, masks=PixelMasks.from_images(keep))
-    model.config.train.background = "auto" if transparent else "#ffffff"
-    look = model.own_look(views)
-    assert look.background == WHITE
-    faint = model.gaussians.map(torch.clone)
-    faint.opacities -= 3.0
-    found = mean_psnr(faint, views, look)
-    assert found == pytest.approx(evaluate(faint, views, look).mean.psnr, abs=1e-4)
-    assert abs(found - mean_psnr(faint, views, replace(look, background=BLACK))) > 0.1
 
 
 def test_a_given_model_has_the_background_of_its_photos(capture):
@@ -129,7 +105,7 @@ def test_bad_input_is_one_line(turbogs, finished, capture, tmp_path):
 )
 def test_a_film_that_cannot_be_made_is_refused(turbogs, finished, tmp_path, monkeypatch, options, words):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(film.importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setattr(renders.importlib.util, "find_spec", lambda name: name)
     refused(turbogs("render", finished, *options), words)
     assert not list(tmp_path.iterdir())
 
@@ -138,7 +114,7 @@ def test_a_film_has_the_background(model, scene, tmp_path):
     ffmpeg = pytest.importorskip("imageio_ffmpeg")
     look = replace(model.own_look(), background=WHITE)
     empty = model.gaussians.map(lambda value: value[:0])
-    film.write_film(empty, look, film.film_cameras("views", scene, 0.05), tmp_path / "a.mp4")
+    renders.write_film(empty, look, renders.film_cameras("views", scene, 0.05), tmp_path / "a.mp4")
     _, frame, *_ = ffmpeg.read_frames(str(tmp_path / "a.mp4"))
     assert np.frombuffer(frame, dtype=np.uint8).min() > 250
 

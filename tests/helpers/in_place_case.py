@@ -84,7 +84,7 @@ class Kept:
             torch.testing.assert_close(records[seen], target.records[seen], rtol=0, atol=0, equal_nan=True)
         for shares, own, found in self.colors:
             own = found[:0] if own is None else own
-            colors = torch.cat(ranks.to_all(own.flatten(), [3 * share.num_slots for share in shares]))
+            colors = torch.cat(ranks.exchange([own.flatten()] * ranks.count, [3 * share.num_slots for share in shares]))
             torch.testing.assert_close(colors.view(-1, 3), found, rtol=0, atol=0, equal_nan=True)
         for rows, own, found in self.parameters:
             sent = found.map(torch.zeros_like)

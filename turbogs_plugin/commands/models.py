@@ -79,7 +79,7 @@ def render(
         device: where to render.
     """
     if path is not None:
-        from turbogs_plugin.export.film import film_run
+        from turbogs_plugin.export.renders import film_run
 
         if depth or split != "test" or out is None:
             raise InputError("--path writes a film: it takes --out FILE.mp4 and --seconds, not --split or --depth")

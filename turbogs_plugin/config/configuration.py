@@ -178,8 +178,6 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         # A colour as #336699 or a path as "try #2" would be a comment of YAML, or end in one.
         plain = re.search(r"(^|\s)#", text) and text.lstrip()[0] not in "'\"[{"
         parsed = {"value": text} if plain else parse_yaml(f"value: {text}", f"override '{override}'")
-        if set(parsed) != {"value"}:
-            raise InputError(f"override '{override}' has more than one value")
         nested: Any = parsed["value"]
         for key in reversed(keys):
             nested = {key: nested}

@@ -38,7 +38,7 @@ class Messages:
         flat = [] if own is None else [own.flatten()]
         message = torch.cat([status.view(torch.float32), *flat])
         counts = [share.num_slots for share in shares]
-        parts = self._ranks.to_all(message, [PassStatus.SIZE + 3 * count for count in counts])
+        parts = self._ranks.exchange([message] * self._ranks.count, [PassStatus.SIZE + 3 * count for count in counts])
         return SharedEngine.gather(engine, parts, PassStatus.SIZE, counts, seen)  # in torch: for many processes, too
 
     def collect(
@@ -93,7 +93,7 @@ def gather_rows(ranks: ProcessRanks, tensors: Sequence[Tensor]) -> None:
     widths = [value.shape[1] for value in flat]
     counts = [part.stop - part.start for part in rows]
     own = torch.cat([value[rows[ranks.rank]].flatten() for value in flat])
-    messages = ranks.to_all(own, [sum(widths) * count for count in counts])
+    messages = ranks.exchange([own] * ranks.count, [sum(widths) * count for count in counts])
     for part, count, message in zip(rows, counts, messages, strict=True):
         pieces = message.split([width * count for width in widths])
         for value, width, piece in zip(flat, widths, pieces, strict=True):

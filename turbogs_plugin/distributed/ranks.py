@@ -126,10 +126,6 @@ class ProcessRanks(Ranks):
         self._distributed.all_to_all_single(received, torch.cat(list(sent)), list(sizes), [len(part) for part in sent])
         return list(received.split(list(sizes)))
 
-    def to_all(self, own: Tensor, sizes: Sequence[int]) -> list[Tensor]:
-        """`exchange` where a process sends one tensor to all."""
-        return self.exchange([own] * self.count, sizes)
-
     def ask_to_stop(self, signal: int) -> bool:
         self.asked = signal
         return True

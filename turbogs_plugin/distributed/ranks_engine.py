@@ -138,8 +138,7 @@ class RanksEngine:
         moments: GaussianMoments,
         stats: GaussianStats | None,
     ) -> None:
-        if not isinstance(screen, SharedScreen):
-            raise TypeError(f"gradients of {type(screen).__name__} are not of a pass of several processes")
+        assert isinstance(screen, SharedScreen), "gradients are not of a pass of several processes"
         if self._owned is None:
             self._skipped = moments.skipped.clone()
         if self._owned is None or not all(map(is_, self._owned.whole, (gaussians, moments, stats))):
@@ -207,8 +206,6 @@ class SharedRendered(Rendered):
         plain = None
         if self._rendered is not None:
             slots = self.batch.shares[self.batch.rank].slots
-            if upstream.alpha_gradients is not None or upstream.depth_gradients is not None:
-                raise NotImplementedError("several processes train by gradients of colors alone")
             errors = None if upstream.pixel_errors is None else upstream.pixel_errors[slots]
             own = self._rendered.backward(upstream.color_gradients[slots], errors, with_statistics=with_statistics)
             plain = own.plain()

@@ -6,6 +6,7 @@ direction is lost, and how much that costs is measured and said on the page.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from html import escape
 
 import numpy as np
@@ -28,29 +29,20 @@ WIDEST = 25.0
 """Largest standard deviation, in units of the scene's extent, whose covariance float16 holds."""
 
 
-def page_gaussians(gaussians: Gaussians, cameras: Cameras, sh_degree: int) -> Gaussians:
-    """The finite Gaussians of a model, each in the one colour that it has on the page; without higher bands.
+def page_gaussians(model: Gaussians, cameras: Cameras, sh_degree: int) -> Gaussians:
+    """A model whose Gaussians have the one colour each that they have on the page; without higher bands.
 
     Args:
-        gaussians: in the scene's frame, on any device.
+        model: in the scene's frame, on any device; finite, as saved models are.
         cameras: of the training views.
         sh_degree: highest degree in use.
     """
-    finite = gaussians.finite_rows()
-    model = gaussians.map(lambda value: value[finite])
     chosen = evenly(len(cameras), MOST_DIRECTIONS)
     colors = torch.zeros_like(model.means)  # [N, 3]
     for center in cameras.centers[chosen].to(model.means):
         seen = evaluate(model.sh0, model.shN, unit_directions(model.means - center), sh_degree)
         colors += (seen + 0.5).clamp(0.0, 1.0) / len(chosen)
-    return Gaussians(
-        means=model.means,
-        quats=model.quats,
-        scales=model.scales,
-        opacities=model.opacities,
-        sh0=((colors - 0.5) / SH_C0)[:, None],
-        shN=model.shN[:, :0],
-    )
+    return replace(model, sh0=((colors - 0.5) / SH_C0)[:, None], shN=model.shN[:, :0])
 
 
 def html_page(gaussians: Gaussians, cameras: Cameras, background: Color, title: str, caption: str) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -19,11 +18,10 @@ from turbogs_plugin.export.html_page import html_page, page_gaussians
 from turbogs_plugin.files import require_new_file, write_text_atomically
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.similarity import Similarity
-from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.geometry import evenly
+from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.inputs import resolve_device
-from turbogs_plugin.train.look import Look
-from turbogs_plugin.train.metrics import psnr, render_view
+from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.saved_model import load_with_capture
 from turbogs_plugin.types import Cameras, Gaussians
 
@@ -79,10 +77,12 @@ def export_run(
     lost = f"not measured: {absent or 'the capture has no test views'}"
     caption = f"{len(written):,} Gaussians, one colour each"
     if scene is not None and len(scene.test):
-        look, to_device = model.own_look(scene.test), partial(torch.Tensor.to, device=whole.device)
-        before, after = (mean_psnr(each, scene.test, look) for each in (whole, written.map(to_device)))
-        measured = f"on {min(MOST_VIEWS, len(scene.test))} of {len(scene.test)} test views"
-        lost = f"{before:.3f} -> {after:.3f} dB {measured}"
+        test, chosen = place_views(scene.test, whole.device, "host"), evenly(len(scene.test), MOST_VIEWS)
+        look, to_device = model.own_look(test), partial(torch.Tensor.to, device=whole.device)
+        shown = [(each, min(look.sh_degree, each.sh_degree)) for each in (whole, written.map(to_device))]
+        errors = [evaluate(each, test, replace(look, sh_degree=degree), view_ids=chosen) for each, degree in shown]
+        before, after = (each.mean.psnr for each in errors)
+        lost = f"{before:.3f} -> {after:.3f} dB on {len(chosen)} of {len(test)} test views"
         caption += f": PSNR {after:.2f} dB on test views, {before:.2f} dB in the trained model"
     if is_page and scene is not None:
         background = model.own_look(scene.train).background
@@ -91,24 +91,6 @@ def export_run(
     size = f"{held:,} bytes in float32 -> {file.stat().st_size:,} bytes in the file"
     said = f" ({'; '.join(notes)})" if notes else ""
     return f"{file}{said}\nsize   {size}, {len(written)} of {len(whole)} Gaussians\nPSNR   {lost}"
-
-
-@torch.no_grad()
-def mean_psnr(model: Gaussians, views: PosedImages, look: Look) -> float:
-    """Mean PSNR in dB of a model on at most `MOST_VIEWS` views, without masked pixels.
-
-    Args:
-        model: in the scene's frame, on the device that renders.
-        views: the test views, at least one, on any device.
-        look: how the model is shown; without exposures, as a file of a model holds none.
-    """
-    views, values = views.with_cameras_on(model.device), []
-    look = replace(look, sh_degree=min(look.sh_degree, model.sh_degree))
-    for view_id in evenly(len(views), MOST_VIEWS):
-        image = render_view(model, views, view_id, look)
-        photo, mask = views.photos.image(view_id, look.background).to(model.device), views.mask(view_id)
-        values.append(psnr(image, photo) if mask is None else psnr(image[mask], photo[mask]))
-    return fmean(values)
 
 
 def _require_options(

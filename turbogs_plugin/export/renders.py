@@ -1,7 +1,9 @@
-"""Renders of a saved model from its capture's cameras, as PNGs (`turbogs render`)."""
+"""Renders of a saved model: from its capture's cameras as PNGs, and films along a path of cameras, 60 frames a second,
+encoded by the ffmpeg of imageio-ffmpeg (`turbogs render`)."""
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,9 +13,23 @@ import numpy as np
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import naming, require_writable, unused_name
+from turbogs_plugin.export.camera_path import from_file, orbit, through_views
+from turbogs_plugin.files import naming, require_new_file, require_writable, unused_name
 from turbogs_plugin.report.evaluation import open_saved, views_of
 from turbogs_plugin.report.images import depth_picture, save_image, to_uint8
+from turbogs_plugin.scene import Scene
+from turbogs_plugin.train.look import Look
+from turbogs_plugin.types import Cameras, Gaussians
+
+RATE = 60
+"""Frames a second."""
+PATHS = ("orbit", "views")
+SUFFIXES = (".mp4", ".mkv", ".mov")
+CODEC = "libx264"
+"""Encoder of H.264, which all of these files hold; imageio-ffmpeg would try others first."""
+INSTALL = 'pip install "turbogs-plugin[video]"'
+QUALITY = 8
+"""Quality for imageio-ffmpeg, 0 .. 10."""
 
 
 def render_run(
@@ -71,3 +87,79 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
     for name in names:
         stems[unused_name(Path(name).with_suffix("").as_posix().replace("/", "__"), stems)] = None
     return list(stems)
+
+
+def film_run(
+    path: Path, camera_path: str, video: Path, seconds: float, device_name: str, given: Config | None = None
+) -> Path:
+    """Write a film of a run's newest model or of a given one.
+
+    Args:
+        path: folder of the run, or the file of a model.
+        camera_path: orbit, views, or a file of cameras.
+        video: new file.
+        seconds: length of the film.
+        device_name: where to render.
+        given: the capture of a model from a file, and how to render it; None: `path` is a run.
+
+    Raises:
+        InputError: an option does not fit, no such model, or no usable capture.
+    """
+    if importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise InputError(f"a film needs imageio-ffmpeg: {INSTALL}")
+    if not 0 < seconds <= 3600:
+        raise InputError(f"--seconds {seconds:g}: it must be more than 0 and at most 3600")
+    if camera_path not in PATHS and not Path(camera_path).is_file():
+        raise InputError(f"--path '{camera_path}': it must be orbit, views, or a file of cameras")
+    if video.suffix.lower() not in SUFFIXES:
+        raise InputError(f"--out '{video}': a film needs a new file that ends in {', '.join(SUFFIXES)}")
+    require_new_file(video, "--out")
+    require_writable(video.parent, f"--out '{video}'")
+    model, scene = open_saved(path, device_name, given)
+    write_film(model.gaussians, model.own_look(scene.train), film_cameras(camera_path, scene, seconds), video)
+    return video
+
+
+def film_cameras(path: str, scene: Scene, seconds: float) -> Cameras:
+    """The cameras of a film's frames, in the scene's frame."""
+    frames = max(1, round(RATE * seconds))
+    if path not in PATHS:
+        return from_file(Path(path), scene.frame, frames)
+    return (orbit if path == "orbit" else through_views)(scene.train.cameras, frames)
+
+
+def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) -> None:
+    """Render and encode a film. Nothing is left behind where this fails.
+
+    Args:
+        gaussians: the model, on the device that renders.
+        look: how it is shown, without exposures.
+        cameras: of the frames, all of one size; an odd side loses a pixel, which the encoder needs.
+        video: a new file, whose suffix says which container.
+
+    Raises:
+        InputError: the encoder refused.
+    """
+    import imageio_ffmpeg
+    from rich.console import Console
+    from rich.progress import track
+
+    width, height = (cameras.sizes[0] // 2 * 2).tolist()
+    cameras = cameras.to(gaussians.device)
+    # Its own suffix last, by which ffmpeg knows the container.
+    temporary = video.with_name(f".{video.stem}.part{video.suffix}")
+    options = {"fps": RATE, "codec": CODEC, "quality": QUALITY, "macro_block_size": 1, "ffmpeg_log_level": "error"}
+    writer = imageio_ffmpeg.write_frames(str(temporary), (width, height), **options)
+    try:
+        writer.send(None)
+        told = Console(stderr=True)
+        for frame in track(range(len(cameras)), "frames", console=told, disable=not sys.stderr.isatty()):
+            image = render_image(gaussians, cameras, frame, **look.options)
+            writer.send(np.ascontiguousarray(to_uint8(image.colors)[:height, :width]))
+        writer.close()
+        temporary.replace(video)
+    except OSError as error:  # of the pipe to the encoder
+        raise InputError(f"--out '{video}' cannot be encoded: {' '.join(str(error).split())[:200]}") from None
+    finally:
+        writer.close()
+        temporary.unlink(missing_ok=True)

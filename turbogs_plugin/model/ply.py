@@ -8,7 +8,7 @@ from typing import BinaryIO
 import numpy as np
 import torch
 
-from turbogs_plugin.errors import InputError, refusal
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.model.gsplat_file import BANDS
 from turbogs_plugin.model.similarity import in_capture, rounding
@@ -33,7 +33,8 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
         frame: if given, the model is written in the capture's own coordinates.
 
     Raises:
-        InputError: there is nothing to write, or the file cannot be written.
+        InputError: there is nothing to write.
+        OSError: from the disk.
     """
     path, frame = Path(path), frame or Frame(np.zeros(3), 1.0)
     rows = in_capture(gaussians, frame, path, double_means=True)
@@ -54,10 +55,7 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
         file.write("\n".join([*header, "end_header\n"]).encode())
         file.write(table.data)
 
-    try:
-        write_atomically(path, write)
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {refusal(error)}") from error
+    write_atomically(path, write)
 
 
 def read_ply(path: str | Path) -> Gaussians:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
 import torch
@@ -85,8 +85,9 @@ def evaluate(
     look: Look,
     lpips: ImageError | None = None,
     refined: bool = False,
+    view_ids: Sequence[int] | None = None,
 ) -> Metrics:
-    """Render every view, one at a time, and compare it with its photo. Where views have exposures, errors of the
+    """Render views, one at a time, and compare it with its photo. Where views have exposures, errors of the
     model's own colours are given beside.
 
     Args:
@@ -95,11 +96,13 @@ def evaluate(
         look: how the model is shown.
         lpips: from `load_lpips`, if wanted. It sees the photo's pixels where it is masked.
         refined: where views have refined cameras, give the errors by these cameras, too.
+        view_ids: at least one; None: all.
     """
     metrics: list[ViewMetrics] = []
     seconds = 0.0
     moved = replace(views, cameras=views.refined) if refined and views.refined is not None else None
-    for view_id, name in enumerate(views.names):
+    for view_id in range(len(views)) if view_ids is None else view_ids:
+        name = views.names[view_id]
         synchronize(gaussians.device)
         started = time.perf_counter()
         own = _render(gaussians, views, view_id, look)
@@ -216,12 +219,7 @@ class Evaluations(Listener):
     def evaluation_due(self, loop: TrainingLoop) -> None:
         trainer = loop.trainer
         trainer.require_finite()
-        metrics = evaluate(
-            trainer.gaussians,
-            self.test,
-            trainer.look(self.test.names),
-            refined=loop.finished,
-        )
+        metrics = evaluate(trainer.gaussians, self.test, trainer.look(self.test.names), refined=loop.finished)
         mean = metrics.mean
         evaluation = Evaluation(
             iteration=trainer.iteration,

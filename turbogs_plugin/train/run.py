@@ -119,7 +119,7 @@ def train(
         watch: further listeners.
 
     Raises:
-        InputError: anything wrong with the input; then nothing was written.
+        InputError: anything wrong with the input; then nothing was written, unless a strategy says so in an iteration.
         TrainingStopped: the run cannot go on; the files that it saved stay.
     """
     clock = clock or WallClock()
@@ -178,8 +178,7 @@ def resume(
     scene, device = open_started(config, clock, ranks)
     hold_to_limit(config, device)
     with _fitting(scene):
-        resuming = state is not None
-        trainer = Trainer(config, scene, device, resuming, ranks.engine(device))
+        trainer = Trainer(config, scene, device, state is not None, ranks.engine(device))
         loop = TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), ranks=ranks)
         session = RunSession(folder, scene, loop, clock)
         if state is not None:

@@ -44,13 +44,6 @@ class RunFolder:
         that is `reported`."""
         return self.model.is_file() and (self.report.is_file() or not reported)
 
-    def discard(self) -> None:
-        """Remove what a run wrote that never came to a checkpoint, and the folder if nothing else is in it."""
-        for path in (self.asked, self.config, self.plan, self.history, self.wall):
-            path.unlink(missing_ok=True)
-        if self.path.is_dir() and not any(self.path.iterdir()):
-            self.path.rmdir()
-
     def read_config(self) -> Config:
         """The resolved configuration of the run. Raises `InputError` if this is no run, or part of it is missing."""
         return self._read(self.config, decided=True)

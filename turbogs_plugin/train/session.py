@@ -112,12 +112,6 @@ class RunSession(Listener):
             write_text_atomically(self.folder.wall, json.dumps(asdict(self.wall), indent=1) + "\n")
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
-        except InputError as error:  # in an iteration: from a strategy of one's own, say
-            if latest_checkpoint(self.folder.checkpoints) is not None:
-                raise TrainingStopped(f"{error}; {self._last_good()}") from error
-            if ranks.first:
-                self.folder.discard()
-            raise
         except torch.cuda.OutOfMemoryError as error:
             raise TrainingStopped(
                 f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)} "
