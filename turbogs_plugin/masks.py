@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.tiles import TILE_PIXELS, pixel_table, tile_extents
+from turbogs_plugin.tiles import TILE_PIXELS, pixel_table, tile_areas
 from turbogs_plugin.types import TILE_SIZE, PixelSamples, TileGrid
 
 WORD_BITS = 32
@@ -57,7 +57,7 @@ class PixelMasks:
         places = padded.reshape(rows, TILE_SIZE, columns, TILE_SIZE).swapaxes(1, 2).reshape(-1, TILE_PIXELS)
         counts, sizes = places.sum(axis=1), np.array([[width, height]], dtype=np.int64)
         live = np.flatnonzero(counts)
-        cut = counts[live] < np.multiply(*tile_extents(sizes))[live]  # [L] bool, the mask takes pixels of the tile
+        cut = counts[live] < tile_areas(sizes)[live]  # [L] bool, the mask takes pixels of the tile
         packed = np.ascontiguousarray(np.packbits(places[live[cut]][:, _PLACES], axis=1, bitorder="little"))
         return cls(
             sizes=sizes,

@@ -23,11 +23,6 @@ def _places(device: torch.device | str) -> tuple[Tensor, Tensor]:
     return x[order], y[order]
 
 
-def slots_of_tiles(wanted: int, sizes: np.ndarray) -> np.ndarray:
-    """[T] int64: slots of each tile of ``TileGrid(sizes)``: `wanted` pixels, or all that the tile has."""
-    return np.minimum(wanted, np.multiply(*tile_extents(sizes)))
-
-
 @dataclass(frozen=True)
 class DrawEnds:
     """`PixelSamples.host_ends` of a draw whose sizes the host knows. Equal draws have equal ends.
@@ -51,7 +46,7 @@ class DrawEnds:
         if self.live is not None:
             return np.cumsum(self.live), np.cumsum(np.full(sum(self.live), self.wanted[0]))
         sizes = np.array(self.sizes, dtype=np.int64)
-        return TileGrid(sizes).offsets[1:], np.cumsum(slots_of_tiles(self.wanted[0], sizes))
+        return TileGrid(sizes).offsets[1:], np.cumsum(np.minimum(self.wanted[0], tile_areas(sizes)))
 
 
 def pixel_table(sizes: np.ndarray, device: torch.device | str, origin: tuple[int, int] = (0, 0)) -> Tensor:
@@ -71,13 +66,13 @@ def pixel_table(sizes: np.ndarray, device: torch.device | str, origin: tuple[int
     return torch.cat(tables)
 
 
-def tile_extents(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Width and height, [T] int64 each, of the part of each tile of ``TileGrid(sizes)`` that lies in its image."""
-    widths, heights = [], []
+def tile_areas(sizes: np.ndarray) -> np.ndarray:
+    """[T] int64: pixels of each tile of ``TileGrid(sizes)`` that lie in its image."""
+    areas = []
     for (width, height), (columns, rows) in zip(sizes, TileGrid(sizes).shapes, strict=True):
-        widths.append(np.tile(np.minimum(TILE_SIZE, width - TILE_SIZE * np.arange(columns)), rows))
-        heights.append(np.repeat(np.minimum(TILE_SIZE, height - TILE_SIZE * np.arange(rows)), columns))
-    return np.concatenate(widths), np.concatenate(heights)
+        widths = np.minimum(TILE_SIZE, width - TILE_SIZE * np.arange(columns))
+        areas.append(np.outer(np.minimum(TILE_SIZE, height - TILE_SIZE * np.arange(rows)), widths).reshape(-1))
+    return np.concatenate(areas)
 
 
 def compact(
@@ -130,7 +125,7 @@ def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.devic
         tile_ids=torch.arange(len(offsets) - 1, dtype=torch.int32, device=device),
         tile_offsets=offsets,
         has_empty_slots=False,
-        host_ends=lambda: (TileGrid(sizes).offsets[1:], np.cumsum(np.multiply(*tile_extents(sizes)))),
+        host_ends=lambda: (TileGrid(sizes).offsets[1:], np.cumsum(tile_areas(sizes))),
     )
 
 
@@ -139,6 +134,6 @@ def _dense(sizes_bytes: bytes, device: torch.device) -> tuple[Tensor, Tensor]:
     """[P] int32 pixel ids and [T + 1] int32 first slots of each tile of dense views, whose [K, 2] int64 sizes are these
     bytes. Kept, as making them anew would let every iteration of a dense trainer wait for the device."""
     sizes = np.frombuffer(sizes_bytes, dtype=np.int64).reshape(-1, 2)
-    table, slots = pixel_table(sizes, device), np.multiply(*tile_extents(sizes))
+    table, slots = pixel_table(sizes, device), tile_areas(sizes)
     offsets = torch.as_tensor(np.concatenate([[0], np.cumsum(slots)]), dtype=torch.int32, device=device)
     return table[table >= 0], offsets

@@ -64,14 +64,12 @@ def trainer_of(
     return trainer
 
 
-def run(trainer: Trainer, ways: list[bool], possible: bool | None = True) -> dict:
-    """The state after a step for each of these, which say whether in place, with an evaluation in the middle.
-    `possible`: None where memory may end on the way."""
-    for number, way in enumerate(ways):
-        trainer.engine.in_place = way
+def run(trainer: Trainer, way: bool | None = True) -> dict:
+    """The state after `STEPS`, with an evaluation in the middle. `way`: in place; None where memory may end then."""
+    for number in range(STEPS):
         trainer.step()
-        assert possible is None or (trainer.engine._exchange is trainer.engine.memory) == (way and possible)
-        if number == len(ways) // 2:
+        assert way is None or (trainer.engine._exchange is trainer.engine.memory) == way
+        if number == STEPS // 2:
             trainer.dense_errors(0)
             trainer.complete()
     trainer.complete()
@@ -90,20 +88,17 @@ def every_case(capture: Path, folder: Path) -> None:
     ranks, wanted = grouped(), {}
     in_place.LEAST = 0  # these memories are files
     for name in CASES if ranks.count == 2 else OF_THREE:
-        trainer = trainer_of(capture, ranks, PeerFiles(folder / f"{name}-messages"), *CASES[name])
-        wanted[name] = run(trainer, [False] * STEPS)
+        trainer = trainer_of(capture, ranks, PeerFiles(folder / f"{name}-messages", most=0), *CASES[name])
+        wanted[name] = run(trainer, False)
         memory = PeerFiles(folder / name)
         trainer = trainer_of(capture, ranks, memory, *CASES[name])
         number = len(trainer.gaussians)
-        same(run(trainer, [True] * STEPS), wanted[name])
+        same(run(trainer), wanted[name])
         assert len(trainer.gaussians) != number
         assert memory.barriers == [WRITTEN, DRAWN, STEPPED] * STEPS
     few(capture, ranks, folder)
     if ranks.count > 2:
         return
-    turns, files = [True, False, True, False, True], PeerFiles(folder / "turns")
-    same(run(trainer_of(capture, ranks, files), turns), wanted["usual"])
-    assert files.barriers.count(STEPPED) == sum(turns)
     without_some_memory(capture, ranks, folder, wanted["usual"])
     growing(capture, ranks, folder, wanted["usual"])
     lost(capture, ranks, folder)
@@ -114,11 +109,11 @@ def without_some_memory(capture: Path, ranks: ProcessRanks, folder: Path, wanted
     Nobody asks again. An engine that keeps no passes sends messages, too."""
     for most in (1, 3):  # the first one is the model's, the others are of passes
         files = PeerFiles(folder / f"only {most}", most=most)
-        same(run(trainer_of(capture, ranks, files), [True] * STEPS, possible=None), wanted)
+        same(run(trainer_of(capture, ranks, files), None), wanted)
         in_place_steps = files.barriers.count(STEPPED)
         assert files.refused == 1 and (0 < in_place_steps < STEPS if most > 1 else in_place_steps == 0)
     files = PeerFiles(folder / "none kept")
-    same(run(trainer_of(capture, ranks, files, engine=ReferenceEngine()), [True] * STEPS, possible=False), wanted)
+    same(run(trainer_of(capture, ranks, files, engine=ReferenceEngine()), False), wanted)
     assert not files.barriers
 
 
@@ -129,7 +124,7 @@ def growing(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> N
     files = PeerFiles(folder / "growing")
     trainer = trainer_of(capture, ranks, files)
     counts = [len(trainer.gaussians)]
-    same(run(trainer, [True] * STEPS), wanted)
+    same(run(trainer), wanted)
     counts.append(len(trainer.gaussians))
     widths = [value[0].numel() for _, value in trainer.gaussians.items()]
     sizes = [aligned_starts([count * width for width in widths])[-1] for count in counts]
@@ -142,11 +137,11 @@ def few(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
     count, states = 4 * (ranks.count - 1), []
     assert rows_of(count, ranks.count)[-1] == slice(count, count)
     for way in (False, True):
-        files = PeerFiles(folder / f"few-{way}")
+        files = PeerFiles(folder / f"few-{way}", most=100 * way)
         trainer = trainer_of(capture, ranks, files, "density.type=none")
         first = trainer.gaussians.map(torch.clone)
         trainer.begin_with(first.map(lambda value: value[:count].clone()))
-        states.append(run(trainer, [way] * STEPS))
+        states.append(run(trainer, way))
         assert not torch.equal(trainer.gaussians.means, first.means[:count])
         assert files.barriers.count(STEPPED) == way * STEPS
     same(*states)
@@ -157,8 +152,8 @@ def lost(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
     states = []
     for way in (False, True):
         engine = KeepingEngine(lose=2 if ranks.rank == ranks.count - 1 else None)
-        trainer = trainer_of(capture, ranks, PeerFiles(folder / f"lost-{way}"), "density.type=none", engine=engine)
-        trainer.engine.in_place = way
+        files = PeerFiles(folder / f"lost-{way}", most=100 * way)
+        trainer = trainer_of(capture, ranks, files, "density.type=none", engine=engine)
         TrainingLoop(trainer).advance(6)
         trainer.complete()
         assert engine.recovered == 1 and int(trainer.optimizer.moments.steps.max()) == 6
@@ -211,8 +206,8 @@ def test_all_send_messages_if_one_cannot_share_its_memory(monkeypatch):
         yield memory
         raise ValueError("no peer access\nat line 3")
 
-    for name in peer_memory.SETTINGS:
-        monkeypatch.setenv(name, "1")
+    for name in ("ALLOW_OVERLAPPING_DEVICES", "DISABLE_MULTICAST"):
+        monkeypatch.setenv(f"TORCH_SYMM_MEM_{name}", "1")
     monkeypatch.setattr(peer_memory, "_steps", lambda *arguments: iter([memory] * 3))
     assert share_memory(Alone(1, 1, 1), 10, device) is memory
     for there in (Alone(0), Alone(1, 0), Alone(1, 1, 0)):

@@ -32,7 +32,7 @@ def test_what_is_written_is_what_gsplat_loads(tmp_path, sh_degree):
 
 def test_what_cannot_be_written_is_refused(tmp_path):
     frame = Frame(np.zeros(3), 1.0)
-    with pytest.raises(InputError, match="no Gaussians"):
+    with pytest.raises(InputError, match="none of its 0 Gaussians"):
         save_gsplat(random_gaussians(0), tmp_path / "model.pt", frame)
     with pytest.raises(OSError, match="absent"):
         save_gsplat(random_gaussians(), tmp_path / "absent" / "model.pt", frame)

@@ -77,7 +77,7 @@ def test_nothing_is_written_over_by_a_failure(tmp_path):
     path = tmp_path / "model.ply"
     save_ply(random_gaussians(), path)
     before = path.read_bytes()
-    with pytest.raises(InputError, match="no Gaussians"):
+    with pytest.raises(InputError, match="none of its 0 Gaussians"):
         save_ply(random_gaussians(0), path)
     assert path.read_bytes() == before
     with pytest.raises(OSError, match="absent"):

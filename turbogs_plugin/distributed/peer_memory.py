@@ -19,13 +19,6 @@ from torch import Tensor
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.engine.layout import MAX_PEERS
 
-SETTINGS = {
-    # Every process sees its own GPU alone, as number 0 (`processes.joined`). Torch would take that for one GPU of all.
-    "TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES": "1",
-    "TORCH_SYMM_MEM_DISABLE_MULTICAST": "1",
-}
-"""Environment variables of torch's symmetric memory, where the environment does not set them."""
-
 PROOF_MILLISECONDS = 60_000
 """Time without an answer from another GPU after which the first barrier ends the process. Later ones wait for ever, as
 the first process may evaluate for an hour; a process that is lost is noticed by its launcher."""
@@ -73,8 +66,9 @@ def share_memory(ranks: ProcessRanks, size: int, device: torch.device) -> PeerMe
     """
     if device.type != "cuda":
         return None
-    for name, value in SETTINGS.items():
-        os.environ.setdefault(name, value)
+    # Every process sees its own GPU alone, as number 0 (`processes.joined`). Torch would take that for one GPU of all.
+    os.environ.setdefault("TORCH_SYMM_MEM_ALLOW_OVERLAPPING_DEVICES", "1")
+    os.environ.setdefault("TORCH_SYMM_MEM_DISABLE_MULTICAST", "1")
     steps, memory = _steps(ranks, size), None
     for _ in range(3):  # step by step, so that none waits in one for a process that failed in the step before
         try:

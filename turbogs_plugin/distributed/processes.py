@@ -32,12 +32,6 @@ that ends is noticed at once."""
 MEETING = timedelta(minutes=5)
 """The longest that processes wait for others to be started."""
 
-RUN_ID = "TORCHELASTIC_RUN_ID"
-"""The variable that a launcher gives each of its processes, and none has without one, as under Slurm."""
-
-PR_SET_PDEATHSIG = 1
-"""Option of Linux' `prctl`: the signal that a process gets when its parent ends."""
-
 
 def launched() -> bool:
     """Whether torchrun, or `start`, started this process beside others."""
@@ -112,7 +106,7 @@ def joined(device: str) -> Iterator[Ranks]:
     Raises:
         InputError: there are fewer GPUs than processes on this machine, or the processes do not find each other.
     """
-    if RUN_ID in os.environ:  # without a launcher, the parent, a shell say, may go before its time
+    if "TORCHELASTIC_RUN_ID" in os.environ:  # without a launcher, as under Slurm, a shell may go before its time
         end_with_parent()
     if not launched():
         yield ONE
@@ -170,7 +164,8 @@ def end_with_parent() -> None:
     """
     if sys.platform != "linux":
         return
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, *(ctypes.c_ulong(value) for value in (signal.SIGKILL, 0, 0, 0)))
+    parent_ends = 1  # PR_SET_PDEATHSIG of prctl(2)
+    ctypes.CDLL(None).prctl(parent_ends, *(ctypes.c_ulong(value) for value in (signal.SIGKILL, 0, 0, 0)))
 
 
 def _see_own_gpu() -> None:

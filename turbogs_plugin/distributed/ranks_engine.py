@@ -62,10 +62,6 @@ class RanksEngine:
     Args:
         engine: this process's, on `device`.
         share: gives memory that all processes read and write, or None.
-
-    Attributes:
-        in_place: read the others' memory in place, if that is possible. It may change between two iterations, on all
-            processes alike.
     """
 
     def __init__(
@@ -74,7 +70,6 @@ class RanksEngine:
         self.engine, self.ranks, self.device = engine, ranks, device
         self.draw, self.evaluate, self.learn = engine.draw, engine.evaluate, engine.learn
         self.evaluate_and_learn, self.supervise = engine.evaluate_and_learn, engine.supervise
-        self.in_place = True
         self.memory, self.messages = InPlace(ranks, share), Messages(ranks)
         self._exchange: InPlace | Messages = self.messages  # of the latest pass
         self._passes = 0
@@ -98,8 +93,8 @@ class RanksEngine:
     ) -> SharedRendered:
         rank, shares = self.ranks.rank, shares_of(samples, self.ranks.count)
         own = shares[rank]
-        possible = self.in_place and self.memory.others(gaussians) is not None
-        if possible and self.memory.prepare(self.engine, shares, len(gaussians), self.device):
+        placed = self.memory.others(gaussians) is not None
+        if placed and self.memory.prepare(self.engine, shares, len(gaussians), self.device):
             self._exchange = self.memory
         elif self._exchange is self.memory:
             self.engine.lend(None)
@@ -213,7 +208,7 @@ class SharedRendered(Rendered):
 
 
 @dataclass
-class SharedScreen:
+class SharedScreen(ScreenGradients):
     """Gradients on the screen (`ScreenGradients`), each view's on the process that rendered it."""
 
     batch: Batch
@@ -224,9 +219,6 @@ class SharedScreen:
         whole = self.whole()
         self.batch.exchange.stepped()
         return whole.parameter_gradients(rows, stats)
-
-    def full_records(self) -> Tensor:
-        return self.whole().full_records()
 
     def plain(self) -> ScreenRecords:
         return self.whole().plain()

@@ -9,14 +9,11 @@ from turbogs_plugin.types import Gaussians, RowUpdate, Step
 
 BITS = 21
 """Bits of a coordinate: three coordinates fill 63 bits."""
-SPREADS = (
-    (32, 0x001F00000000FFFF),
-    (16, 0x001F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
+SPREADS = tuple(
+    (2 * run, sum((1 << run) - 1 << 3 * run * place for place in range(BITS)) & (1 << 3 * BITS) - 1)
+    for run in (16, 8, 4, 2, 1)
 )
-"""Shifts and masks that put two empty bits behind each of the 21 bits."""
+"""Shifts and masks that put two empty bits behind each of the 21 bits: runs of bits move apart, then their halves."""
 
 
 def in_order_of_space(update: RowUpdate, gaussians: Gaussians, step: Step) -> RowUpdate:

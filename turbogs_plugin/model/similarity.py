@@ -84,9 +84,7 @@ def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaus
         InputError: no Gaussian is finite.
     """
     rows = change.apply(gaussians).map(lambda value: value.float().contiguous())
-    if not rows.finite_rows().any():
-        raise InputError(f"{source}: none of its {len(rows)} Gaussians is finite: export the model again")
-    return _finite(rows, f"{source}: ")
+    return _finite(rows, source)
 
 
 def in_capture(gaussians: Gaussians, frame: Frame, target: Path, double_means: bool = False) -> Gaussians:
@@ -109,10 +107,7 @@ def in_capture(gaussians: Gaussians, frame: Frame, target: Path, double_means: b
             "precision: export with --format ply"
         )
     means = means if double_means else means.float()
-    rows = _finite(replace(rows, means=means, scales=rows.scales + math.log(frame.scale)))
-    if not len(rows):
-        raise InputError(f"there are no Gaussians to write to {target}")
-    return rows
+    return _finite(replace(rows, means=means, scales=rows.scales + math.log(frame.scale)), target)
 
 
 def rounding(frame: Frame) -> float:
@@ -120,12 +115,16 @@ def rounding(frame: Frame) -> float:
     return float(np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 / frame.scale)
 
 
-def _finite(gaussians: Gaussians, owner: str = "") -> Gaussians:
-    """The Gaussians of which every number is finite, with a warning that counts the others."""
+def _finite(gaussians: Gaussians, file: str | Path) -> Gaussians:
+    """The Gaussians of which every number is finite, with a warning that counts the others. Raises `InputError` where
+    there is none."""
     finite = gaussians.finite_rows()
+    if not finite.any():
+        raise InputError(f"{file}: none of its {len(finite)} Gaussians is finite: there is no model to use")
     if finite.all():
         return gaussians
-    warnings.warn(f"{owner}{int((~finite).sum())} of {len(finite)} Gaussians are not finite and left out", stacklevel=4)
+    count = int((~finite).sum())
+    warnings.warn(f"{file}: {count} of {len(finite)} Gaussians are not finite and left out", stacklevel=4)
     return gaussians.map(lambda value: value[finite])
 
 

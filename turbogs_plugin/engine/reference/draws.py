@@ -50,7 +50,7 @@ from torch import Tensor
 from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, PURPOSE_TILES, Words, exponentials, random_words
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
-from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds, compact, pixel_table, slots_of_tiles
+from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds, compact, pixel_table, tile_areas
 from turbogs_plugin.types import PixelSamples, Step, TileGrid
 
 RANK_BITS = 20
@@ -173,7 +173,7 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
         wanted = [rule.wanted(rate, TILE_PIXELS)] * len(counts)
         drawn, probabilities = draw_units(Units(errors, ages, exist, words(table, PURPOSE_PIXELS), wanted[0]), rule)
         weights = None if probabilities is None else _importance_weights(probabilities, rule)
-        slots = slots_of_tiles(wanted[0], sizes) if live is None else np.full(len(table), wanted[0])
+        slots = np.minimum(wanted[0], tile_areas(sizes)) if live is None else np.full(len(table), wanted[0])
         tile_ids = torch.arange(len(table), device=device) if tile_ids is None else tile_ids
     full = rule.unit == "pixel" and live is None
     samples = compact(view_ids, sizes, table, drawn, tile_ids.int(), slots, weights, full=full, origin=origin)
