@@ -104,7 +104,7 @@ def test_no_sampler_draws_a_masked_pixel_or_a_tile_without_another(sampler, rate
     samples = sampler.sample(maps, views, rate, step(100))
     if not getattr(sampler, "heeds_masks", False):
         samples = maps.masks.strip(samples)
-    firsts = samples.grid.offsets
+    firsts = samples.grid.starts
     live = {int(firsts[k]) + tile: kept for k, view in enumerate(views) for tile, kept in expected[view].items()}
     drawn = pixels_by_tile(samples)
     for tile, pixels in drawn.items():

@@ -25,7 +25,7 @@ def assert_in_order(samples: PixelSamples) -> None:
     x, y = samples.coordinates().unbind(dim=-1)
     tiles, ranks = samples.tile_of_slot(), sample_order(x % 16, y % 16)
     assert ((tiles.diff() > 0) | (ranks.diff() > 0)).all()
-    starts, columns = TileGrid(samples.sizes).offsets[:-1], TileGrid(samples.sizes).shapes[:, 0]
+    starts, columns = TileGrid(samples.sizes).starts[:-1], TileGrid(samples.sizes).shapes[:, 0]
     views = samples.view_of_slot()
     places = torch.as_tensor(starts)[views] + y // 16 * torch.as_tensor(columns)[views] + x // 16
     assert torch.equal(samples.tile_ids[tiles].long(), places)
@@ -42,14 +42,14 @@ def test_all_pixels_are_the_dense_samples():
 def test_a_grid_may_begin_before_its_images(origin):
     grid = TileGrid(SIZES, origin)
     samples = dense_on_grid(SIZES, origin)
-    assert samples.origin == origin and len(samples.grid) == len(grid) == grid.offsets[-1]
+    assert samples.origin == origin and len(samples.grid) == len(grid) == grid.starts[-1]
     x, y = samples.coordinates().unbind(dim=-1)
     column, line = (x + origin[0]) // 16, (y + origin[1]) // 16
     assert grid.shapes.tolist() == [[(w + origin[0] + 15) // 16, (h + origin[1] + 15) // 16] for w, h in SIZES.tolist()]
     views = samples.view_of_slot()
-    places = torch.as_tensor(grid.offsets)[views] + line * torch.as_tensor(grid.shapes)[views, 0] + column
+    places = torch.as_tensor(grid.starts)[views] + line * torch.as_tensor(grid.shapes)[views, 0] + column
     assert torch.equal(samples.tile_ids[samples.tile_of_slot()].long(), places)
-    second = samples.of_tiles(slice(int(grid.offsets[1]), len(grid)), slice(1, 2), slice(37 * 21, 37 * 21 + 16 * 50))
+    second = samples.of_tiles(slice(int(grid.starts[1]), len(grid)), slice(1, 2), slice(37 * 21, 37 * 21 + 16 * 50))
     assert second.tile_ids[0] == 0 and second.origin == origin and (second.view_of_slot() == 0).all()
 
 

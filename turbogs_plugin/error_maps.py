@@ -206,10 +206,6 @@ class ErrorMaps:
         """
         return np.maximum(self._means.read(), 0.0) / self._pixel_counts
 
-    def mean(self) -> float:
-        """Mean over the views of their mean error, the schedule's E_mean. Counts as a call of `view_means`."""
-        return float(self.view_means().mean())
-
     def state_dict(self) -> dict[str, Any]:
         """Plain tensors and numbers; a resume from them gives the same bits."""
         errors, stamps = self._copies()

@@ -112,7 +112,7 @@ class PixelMasks:
             [T] int64 their ids in ``TileGrid(sizes of these views)``, ascending; and [T, 256] bool, which of a tile's
             places (`sample_order`) count. Places outside the image may be True.
         """
-        firsts = TileGrid(self.sizes[list(view_ids)]).offsets.tolist()
+        firsts = TileGrid(self.sizes[list(view_ids)]).starts
         spans = [slice(int(self.offsets[view]), int(self.offsets[view + 1])) for view in view_ids]
         tiles = torch.cat([self.tiles[span].long() + first for span, first in zip(spans, firsts, strict=False)])
         words = self.bits[torch.cat([self.rows[span] for span in spans]).long()]  # [T, WORDS]

@@ -46,7 +46,7 @@ class DrawEnds:
         if self.live is not None:
             return np.cumsum(self.live), np.cumsum(np.full(sum(self.live), self.wanted[0]))
         sizes = np.array(self.sizes, dtype=np.int64)
-        return TileGrid(sizes).offsets[1:], np.cumsum(np.minimum(self.wanted[0], tile_areas(sizes)))
+        return np.array(TileGrid(sizes).starts[1:]), np.cumsum(np.minimum(self.wanted[0], tile_areas(sizes)))
 
 
 def pixel_table(sizes: np.ndarray, device: torch.device | str, origin: tuple[int, int] = (0, 0)) -> Tensor:
@@ -125,7 +125,7 @@ def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.devic
         tile_ids=torch.arange(len(offsets) - 1, dtype=torch.int32, device=device),
         tile_offsets=offsets,
         has_empty_slots=False,
-        host_ends=lambda: (TileGrid(sizes).offsets[1:], np.cumsum(tile_areas(sizes))),
+        host_ends=lambda: (np.array(TileGrid(sizes).starts[1:]), np.cumsum(tile_areas(sizes))),
     )
 
 

@@ -59,7 +59,7 @@ def test_shares_are_the_samples_in_their_order(sizes, views, count, unit, masked
     for share, part in zip([share for share in shares if len(share)], parts, strict=True):
         assert torch.equal(part.view_of_slot() + share.views.start, of_slots[share.slots])
         assert torch.equal(part.coordinates(), samples.coordinates()[share.slots])
-        assert torch.equal(part.tile_ids + samples.grid.offsets[share.views.start], samples.tile_ids[share.tiles])
+        assert torch.equal(part.tile_ids + samples.grid.starts[share.views.start], samples.tile_ids[share.tiles])
         seen = [view for view in range(len(share)) if view + share.views.start != 1 or not masked]
         assert set(part.view_of_slot().tolist()) == set(seen)
         assert len(part.tile_ids) == len(part.tile_offsets) - 1 and int(part.tile_offsets[-1]) == len(part)

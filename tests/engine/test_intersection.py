@@ -22,8 +22,8 @@ def intersections_of(gaussians, cameras, samples):
 def contributing(rows, splats, samples, tile: int) -> torch.Tensor:
     """[R] bool by brute force: alpha reaches the threshold at some pixel of the tile."""
     grid, tile_id = samples.grid, int(samples.tile_ids[tile])
-    view = int(np.searchsorted(grid.offsets, tile_id, side="right")) - 1
-    line, column = divmod(tile_id - int(grid.offsets[view]), int(grid.shapes[view, 0]))
+    view = int(np.searchsorted(grid.starts, tile_id, side="right")) - 1
+    line, column = divmod(tile_id - int(grid.starts[view]), int(grid.shapes[view, 0]))
     width, height = samples.sizes[view]
     left, top = 16 * column - samples.origin[0], 16 * line - samples.origin[1]
     y, x = torch.meshgrid(

@@ -38,7 +38,7 @@ def test_layout(sampler, unit, rate):
     assert grid.origin == samples.origin == ((7, 15) if unit == "tile" else (0, 0))
     x, y = x + samples.origin[0], y + samples.origin[1]  # in the grid
     columns = torch.as_tensor(grid.shapes[:, 0])[view_of_slot]
-    tiles = torch.as_tensor(grid.offsets[:-1])[view_of_slot] + (y // TILE_SIZE) * columns + x // TILE_SIZE
+    tiles = torch.as_tensor(grid.starts[:-1])[view_of_slot] + (y // TILE_SIZE) * columns + x // TILE_SIZE
     assert (tiles == samples.tile_ids[tile_of_slot])[filled].all()
     ranks = torch.where(filled, sample_order(x % TILE_SIZE, y % TILE_SIZE), TILE_SIZE**2)  # empty slots come last
     same_tile = tile_of_slot[1:] == tile_of_slot[:-1]

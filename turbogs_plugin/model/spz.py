@@ -41,15 +41,10 @@ GZIP_LEVEL = 6
 
 
 def save_spz(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0) -> None:
-    """Write a model, whole or not at all, in the capture's own coordinates. Arguments as for `in_capture`; `step` has
-    no place in this format."""
-    content = packed(in_capture(gaussians, frame, path))
-    write_atomically(path, lambda file: file.write(content))
-
-
-def packed(gaussians: Gaussians) -> bytes:
-    """The file's bytes, of a finite model on the CPU in x right, y down, z forward."""
-    values = {name: value.detach().double().numpy() for name, value in gaussians.items()}
+    """Write a model, whole or not at all, in the capture's own coordinates. Arguments and errors as of `in_capture`;
+    `step` has no place in this format. `InputError`, too, where positions are too large for it."""
+    gaussians = in_capture(gaussians, frame, path)
+    values = {name: value.double().numpy() for name, value in gaussians.items()}
     largest = float(np.abs(values["means"]).max())
     bits = min(MOST_FRACTIONAL_BITS, 22 - max(0, math.ceil(math.log2(max(largest, 1e-9)))))
     if bits < 0:
@@ -66,7 +61,8 @@ def packed(gaussians: Gaussians) -> bytes:
         _packed_rotations(values["quats"][:, [1, 2, 3, 0]] * [1.0, -1.0, -1.0, 1.0]).tobytes(),
         _bytes(harmonics * SH_SCALE + 128.0),
     ]
-    return gzip.compress(b"".join(parts), GZIP_LEVEL, mtime=0)
+    content = gzip.compress(b"".join(parts), GZIP_LEVEL, mtime=0)
+    write_atomically(path, lambda file: file.write(content))
 
 
 def read_spz(path: Path) -> Gaussians:

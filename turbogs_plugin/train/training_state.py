@@ -119,7 +119,7 @@ class TrainingState:
         """Set the maps to the errors of a dense render of the initial Gaussians, Algorithm 1's initialization."""
         for view_id in range(len(self.maps.sizes)):
             self.maps.initialise(view_id, self.dense_errors(view_id))
-        self.initial_error = self.maps.mean()
+        self.initial_error = float(self.maps.view_means().mean())
 
     def dense_errors(self, view_id: int) -> Tensor:
         """[H * W] the errors of a dense render of one view; 0 at masked pixels."""

@@ -67,11 +67,6 @@ class TileGrid:
         """K + 1 numbers: the first tile of each image, and at the end the count of all tiles."""
         return _starts(np.asarray(self.sizes, dtype=np.int64).tobytes(), tuple(self.origin))
 
-    @property
-    def offsets(self) -> np.ndarray:
-        """[K + 1] int64: `starts`."""
-        return np.array(self.starts, dtype=np.int64)
-
     def __len__(self) -> int:
         return self.starts[-1]
 
@@ -133,7 +128,7 @@ class PixelSamples:
         sizes = np.array([(width, height)] * count, dtype=np.int64)
         grid = TileGrid(sizes)
         views, y, x = torch.nonzero(mask, as_tuple=True)  # [P] each
-        tiles = torch.as_tensor(grid.offsets[:-1], device=mask.device)[views]
+        tiles = torch.as_tensor(grid.starts[:-1], device=mask.device)[views]
         tiles = tiles + y // TILE_SIZE * int(grid.shapes[0, 0]) + x // TILE_SIZE
         keys, order = (tiles * TILE_SIZE**2 + sample_order(x % TILE_SIZE, y % TILE_SIZE)).sort()
         tile_ids, counts = torch.unique_consecutive(keys // TILE_SIZE**2, return_counts=True)  # [T] each
@@ -153,7 +148,7 @@ class PixelSamples:
         the host waits for the device."""
         if self.host_ends is not None:
             return self.host_ends()
-        views = np.searchsorted(self.tile_ids.cpu().numpy(), self.grid.offsets[1:])
+        views = np.searchsorted(self.tile_ids.cpu().numpy(), self.grid.starts[1:])
         return views, self.tile_offsets[1:].cpu().numpy().astype(np.int64)
 
     def of_tiles(self, tiles: slice, views: slice, slots: slice) -> PixelSamples:
@@ -195,7 +190,7 @@ class PixelSamples:
 
     def view_of_tile(self) -> Tensor:
         """[T] int64: position in the batch (0 .. K-1) of the view of each tile of `tile_ids`."""
-        ends = on_device(self.grid.offsets[1:], self.tile_ids.device)
+        ends = on_device(self.grid.starts[1:], self.tile_ids.device)
         return torch.searchsorted(ends, self.tile_ids.long(), right=True)
 
     def view_of_slot(self) -> Tensor:

@@ -84,7 +84,7 @@ def intersect_tiles(rows: Rows, splats: Splats, samples: PixelSamples, settings:
     sizes = torch.as_tensor(samples.sizes, device=device)  # [K, 2]
     grid = samples.grid
     shapes = torch.as_tensor(grid.shapes, device=device)
-    offsets = torch.as_tensor(grid.offsets, device=device)
+    offsets = torch.as_tensor(grid.starts, device=device)
     num_tiles = len(samples.tile_ids)
     position = torch.full((len(grid),), -1, dtype=torch.int64, device=device)
     position[samples.tile_ids.long()] = torch.arange(num_tiles, device=device)
