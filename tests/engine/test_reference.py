@@ -5,7 +5,6 @@ import pytest
 import torch
 from helpers.gsplat_torch import Drawn, gsplat_torch_render
 from helpers.rendering_scenes import dense_on_grid, make_cameras, make_gaussians, thin_out
-from torch.autograd.function import once_differentiable
 
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference import compositing, projection
@@ -13,7 +12,7 @@ from turbogs_plugin.engine.render import dense_samples, rasterize, render_image
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
-from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, PixelSamples
+from turbogs_plugin.types import PARAMETER_NAMES, GaussianStats, PixelSamples
 
 SIZES = [(37, 29), (20, 50)]
 ACTIVATED = {"opaque": 5.0, "as made": 0.0}
@@ -94,38 +93,6 @@ def test_what_lies_behind_the_end_of_a_pixel_has_no_gradient_at_all():
     assert 10 < int(gradients.touched.sum()) < 190
     for name in PARAMETER_NAMES[:-1]:
         assert float(getattr(gradients, name)[:, ~gradients.touched].abs().max()) == 0
-
-
-class RenderAgain(torch.autograd.Function):
-    """A pass whose backward renders again: `gradcheck` goes backward many times, which one pass refuses."""
-
-    @staticmethod
-    def forward(ctx, cameras, samples, *parameters):
-        ctx.cameras, ctx.samples = cameras, samples
-        ctx.save_for_backward(*parameters)
-        return RenderAgain.render(cameras, samples, parameters)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *gradients):
-        leaves = [value.detach().requires_grad_() for value in ctx.saved_tensors]
-        with torch.enable_grad():
-            outputs = RenderAgain.render(ctx.cameras, ctx.samples, leaves)
-        return None, None, *torch.autograd.grad(outputs, leaves, gradients)
-
-    @staticmethod
-    def render(cameras, samples, parameters):
-        output = rasterize_differentiable(Gaussians(*parameters), cameras, samples, with_depth=True)
-        return output.colors, output.alphas, output.depths
-
-
-def test_gradcheck_through_everything():
-    gaussians, cameras = make_gaussians(3, seed=3, degree=1), make_cameras([(9, 7), (8, 18)])  # further bands: below
-    gaussians.sh0.add_(1.5)  # away from the clamp of colours at zero
-    samples = thin_out(dense_samples(cameras), 0.04, empty_slots=1)
-
-    parameters = [value.clone().requires_grad_() for _, value in gaussians.items()]
-    assert torch.autograd.gradcheck(RenderAgain.apply, (cameras, samples, *parameters), eps=1e-7, atol=1e-6)
 
 
 @pytest.mark.parametrize("opacity", ACTIVATED)

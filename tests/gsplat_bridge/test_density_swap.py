@@ -7,18 +7,15 @@ import pytest
 import torch
 import tyro
 from gsplat import DefaultStrategy, MCMCStrategy
-from helpers.bridge_host import SURGERY, Host, make_splats, surgery
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from helpers.bridge_host import Host, make_splats
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, apply_row_update
+from turbogs_plugin.gsplat_bridge import TurboDensityStrategy, apply_row_update
 from turbogs_plugin.gsplat_bridge.density_swap import GATES
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, RowUpdate, Step
 
 SOON = {"refine_start_iter": 2, "refine_every": 3, "refine_stop_iter": 5, "grow_grad2d": 1e-6}
@@ -238,55 +235,6 @@ def test_a_host_in_double_precision_trains(tells_errors):
     host.train(6)
     assert len(host.splats["means"]) > 40
     assert {value.dtype for value in host.splats.values()} == {torch.float64}
-    host.assert_rows_match()
-
-
-def tag_rows(host: Host) -> None:
-    """Row i has i + 1 as its colour, in every optimizer state and in every statistic."""
-    tags = torch.arange(1.0, 1.0 + len(host.splats["means"]))
-    host.splats["sh0"].data[:] = tags[:, None, None]
-    for name, parameter in host.splats.items():
-        for key, value in host.optimizers[name].state[parameter].items():
-            if key != "step":
-                value[:] = tags.reshape(-1, *[1] * (value.dim() - 1))
-    for value in host.state.values():
-        if isinstance(value, torch.Tensor):
-            value[:] = tags
-
-
-@pytest.mark.parametrize("optimizer", ["torch", "shared"])
-@settings(max_examples=10, deadline=None)
-@given(st.lists(st.sampled_from([*SURGERY, "update"]), min_size=1, max_size=8), st.integers(0, 99))
-def test_rows_keep_what_is_theirs(optimizer, operations, seed):
-    """After any sequence, what a row has is its own or, where the row is new or was reset, zero; some is its own."""
-    generator = torch.Generator().manual_seed(seed)
-    shared = SharedOptimizer(MomentLMOptimizer())
-    host = Host(TurboDensityStrategy(), torch.optim.Adam if optimizer == "torch" else shared)
-    host.step(0)
-    tag_rows(host)
-    for operation in operations:
-        count = len(host.splats["means"])
-        if operation == "update":
-            source = torch.randint(count, (count + 3,), generator=generator)
-            fresh = torch.rand(count + 3, generator=generator) < 0.2
-            apply_row_update(RowUpdate(source, fresh, {}), host.splats, host.optimizers, host.state)
-        else:
-            surgery(operation, host, generator)
-    host.assert_rows_match()
-    tags = host.splats["sh0"].detach()[:, 0, 0]
-    kept = {}
-    for name, parameter in host.splats.items():
-        for key, value in host.optimizers[name].state[parameter].items():
-            if key != "step":
-                kept[name, key] = value
-    kept |= {("statistics", key): value for key, value in host.state.items() if isinstance(value, torch.Tensor)}
-    for place, value in kept.items():
-        rows = value.flatten(1) if value.dim() > 1 else value[:, None]
-        assert ((rows == tags[:, None]) | (rows == 0)).all(), place
-    assert torch.equal(kept["means", "exp_avg"][:, 0] != 0, kept["quats", "exp_avg_sq"][:, 3] != 0)
-    if "update" not in operations:
-        assert torch.equal(host.state["grad_sums"], tags)  # gsplat copies running state to new rows
-    host.step(9)  # it still trains
     host.assert_rows_match()
 
 

@@ -14,7 +14,6 @@ from turbogs_plugin.types import Step
 
 COUNT = 40
 FULL = Step(1200, 3500, 3500, seed=3, scene_extent=2.0)  # no final pruning follows
-FINAL = Step(4000, 5000, 3500)
 GROWS = {
     "grad_threshold": 0.0,
     "absgrad_threshold": 0.0,
