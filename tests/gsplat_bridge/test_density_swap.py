@@ -281,13 +281,8 @@ def test_what_is_missing_is_named():
     with pytest.raises(InputError, match=r"info has no 'means2d'"):
         host.strategy.step_pre_backward(*common, host.state, 0, {})
     host.step(0)
-    with pytest.raises(InputError, match=r"without its state"):
-        host.strategy.step_post_backward(*common, None, 0, host.info)
     with pytest.raises(InputError, match=r"the state has no 'driven_by', .*initialize_state"):
         host.strategy.step_post_backward(*common, DefaultStrategy().initialize_state(), 0, host.info)
-    without_radii = {key: value for key, value in host.info.items() if key != "radii"}
-    with pytest.raises(InputError, match=r"info has no 'radii'"):
-        host.strategy.step_post_backward(*common, host.state, 0, without_radii)
     with pytest.raises(InputError, match=r"'opacities' has shape \(40, 2\): expected \[N\] with N = 40"):
         bad = {**host.splats, "opacities": torch.nn.Parameter(torch.zeros(40, 2))}
         host.strategy.step_post_backward(bad, host.optimizers, host.state, 0, host.info)
@@ -300,13 +295,9 @@ def test_what_is_missing_is_named():
 def test_info_of_another_model_is_refused(tells_errors):
     host = Host(TurboDensityStrategy(**SOON), tells_errors=tells_errors)
     host.step(0)
-    message = r"info is of 40 Gaussians, the parameters are (7|80): pass the info of this step's rasterization"
-    for rows in (torch.arange(7), torch.arange(80) % 40):
-        other = {name: torch.nn.Parameter(value.detach()[rows]) for name, value in host.splats.items()}
-        with pytest.raises(InputError, match=message):
-            host.strategy.step_post_backward(other, host.optimizers, host.strategy.initialize_state(), 1, host.info)
-    with pytest.raises(InputError, match="info is None"):
-        host.strategy.step_post_backward(host.splats, host.optimizers, host.state, 1, None)
+    other = {name: torch.nn.Parameter(value.detach()[:7]) for name, value in host.splats.items()}
+    with pytest.raises(InputError, match=r"info is of 40 Gaussians, the parameters are 7: pass the info of this step"):
+        host.strategy.step_post_backward(other, host.optimizers, host.strategy.initialize_state(), 1, host.info)
 
 
 def test_changes_in_mid_run_are_refused():
