@@ -65,15 +65,6 @@ def test_reduced_copies_are_used_only_where_all_fit(tmp_path, case):
     assert scene.train.cameras.sizes[0].tolist() == [20, 12]
 
 
-def replace_photo(folder: Path, content: bytes) -> None:
-    (folder / "images" / "photo03.png").write_bytes(content)
-
-
-def truncate_photo(folder: Path) -> None:
-    path = folder / "images" / "photo03.png"
-    path.write_bytes(path.read_bytes()[:60])
-
-
 def wrong_size(folder: Path) -> None:
     Image.new("RGB", (24, 40)).save(folder / "images" / "photo03.png")
 
@@ -96,9 +87,7 @@ def remove_model(folder: Path) -> None:
     [
         (remove_model, r"has no points3D\.bin: bring back what is missing, or take that folder away and find"),
         (remove_photos, r"sparse/0 names 9 photos, of which 7 are missing in .*cup \(photo02.png, .*\): at least 3"),
-        (lambda folder: replace_photo(folder, b"\xff"), "cannot read the photo .*photo03.png"),
-        (lambda folder: replace_photo(folder, b""), "cannot read the photo .*photo03.png"),
-        (truncate_photo, "cannot read the photo .*photo03.png"),
+        (lambda folder: (folder / "images/photo03.png").write_bytes(b"\xff"), "cannot read the photo .*photo03.png"),
         (wrong_size, "photo03.png is 24x40 but its camera is 40x24: it was cropped or turned"),
         (deep_photo, "photo03.png has more than 8 bits a channel"),
     ],
@@ -115,7 +104,6 @@ def test_bad_files_are_named(tmp_path, damage, words):
         ({"views": 2}, {}, "has 2 images: at least 3"),
         ({}, {"test_every": 1}, "every image of .* would be a test image"),
         ({}, {"test_every": 0}, "test_every is 0"),
-        ({}, {"factor": 0}, "factor is 0"),
         ({}, {"factor": 2.5}, "factor is 2.5"),
         ({"cameras": (("PINHOLE", 40, 24, [np.nan, 52.0, 21.0, 11.0]),)}, {}, "intrinsics|VerifyParams"),
     ],

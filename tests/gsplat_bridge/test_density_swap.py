@@ -8,6 +8,7 @@ import torch
 import tyro
 from gsplat import DefaultStrategy, MCMCStrategy
 from helpers.bridge_host import Host, make_splats
+from helpers.optimizers import equal
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
@@ -97,7 +98,7 @@ def test_schedule_events_happen_where_gsplats_do(monkeypatch):
 
 
 EVENT = 3
-"""The step of the only event of `EVENTS`' runs."""
+"""The step of the only event of `test_an_event_is_the_controllers`."""
 
 BASE = {
     "refine_start_iter": 2,
@@ -145,47 +146,24 @@ def test_fields_are_the_controllers_settings_whenever_they_change():
     assert [strategy._controller(step).prune_screen_size for step in (4, 5)] == [0.2, 0.0]
 
 
-EVENTS = {
-    "base": ({}, {}),
-    "absgrad": ({"absgrad": False}, {}),
-    "scene_scale": ({}, {}),
-    "seed": ({"seed": 7}, {}),
-    "final_keep": (
-        {"refine_stop_iter": 2, "final_every": 2, "final_keep": 0.7},
-        {"final_every": 2, "final_keep": 0.7},
-    ),
-    "choose_by": 2 * ({"max_gaussians": 45, "choose_by": "squares"},),
-    "pruned by squares": 2 * ({"prune_score_fraction": 0.3, "choose_by": "squares"},),
-}
-"""Name -> values of the strategy's fields, and the controller's by which the same happens; squares need errors."""
-
-
-def controlled(options, before, window, seed, extent, refine_until):
-    """The Gaussians after the event by an `ErrorDrivenDensity` with exactly these options, in the order of space."""
-    controller = ErrorDrivenDensity(**options)
+def controlled(before, window, seed, extent):
+    """The Gaussians after the event by an `ErrorDrivenDensity`, in the order of space."""
+    controller = ErrorDrivenDensity(**BASE_OF_CONTROLLER)
     controller.setup(before)
     controller.load_state_dict({"stats": window})
-    step = Step(EVENT, 10**6, refine_until, seed, extent)
-    update = controller.update(before, step)
-    return before if update is None else in_order_of_space(update, before, step).apply(before)
+    step = Step(EVENT, 10**6, 14_999, seed, extent)
+    return in_order_of_space(controller.update(before, step), before, step).apply(before)
 
 
-def differ(some: Gaussians, other: Gaussians) -> bool:
-    return any(
-        not torch.equal(value, other_value)
-        for (_, value), (_, other_value) in zip(some.items(), other.items(), strict=True)
-    )
-
-
+@pytest.mark.parametrize("tells_errors", [True, False])
 @pytest.mark.parametrize(
-    ("name", "tells_errors"), [*((name, True) for name in EVENTS), *((name, False) for name in list(EVENTS)[:5])]
+    ("fields", "extent"), [({}, 1.0), ({"absgrad": False}, 1.0), ({}, 1.2), ({"seed": 7}, 1.0)], ids=str
 )
-def test_an_event_is_the_controllers_with_these_values(name, tells_errors):
-    """A field changes the event: with the base's values the controller does something else."""
-    fields, options = EVENTS[name]
+def test_an_event_is_the_controllers(fields, extent, tells_errors):
+    """What is no setting of the controller changes the event: with other values the controller does something else."""
     strategy = TurboDensityStrategy(**{**BASE, **fields})
     host = Host(strategy, tells_errors=tells_errors)
-    extent = host.state["scene_scale"] = 1.2 if name == "scene_scale" else 1.0
+    host.state["scene_scale"] = extent
     seen, before = [], {}
     step_post_backward = strategy.step_post_backward
 
@@ -204,15 +182,13 @@ def test_an_event_is_the_controllers_with_these_values(name, tells_errors):
         window |= {"error_sums": window["grad_sums"], "weight_sums": window["view_counts"]}
     without_absolute = {**window, "absgrad_sums": torch.zeros(40)}
     before = Gaussians(**{key: before[key] for key in PARAMETER_NAMES})
-    until = fields.get("refine_stop_iter", 15_000) - 1
-    used = window if strategy.absgrad else without_absolute
-    expected = controlled({**BASE_OF_CONTROLLER, **options}, before, used, strategy.seed, extent, until)
+    expected = controlled(before, window if strategy.absgrad else without_absolute, strategy.seed, extent)
     after = Gaussians(**{key: host.splats[key].detach() for key in PARAMETER_NAMES})
     for (key, value), (_, wanted) in zip(after.items(), expected.items(), strict=True):
         torch.testing.assert_close(value, wanted, msg=lambda text, key=key: f"{key}: {text}")
     assert all(len(host.state[key]) == len(after) and not host.state[key].any() for key in window)
-    if name != "base":
-        assert differ(after, controlled(BASE_OF_CONTROLLER, before, window, 0, 1.0, 14_999))
+    if fields or extent != 1.0:
+        assert not equal(after, controlled(before, window, 0, 1.0))
 
 
 def test_a_cap_holds_at_any_step():

@@ -16,7 +16,7 @@ WIDTH, HEIGHT = 40, 24
 RATES = {"means": 1e-3, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 1e-2, "shN": 5e-4}
 
 
-def make_splats(count: int = 40, seed: int = 0, bands: int = 3, device: str = "cpu") -> torch.nn.ParameterDict:
+def make_splats(count: int = 40, seed: int = 0, device: str = "cpu") -> torch.nn.ParameterDict:
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -28,7 +28,7 @@ def make_splats(count: int = 40, seed: int = 0, bands: int = 3, device: str = "c
         "quats": normal(count, 4),
         "opacities": normal(count),
         "sh0": normal(count, 1, 3),
-        "shN": 0.1 * normal(count, bands, 3),
+        "shN": 0.1 * normal(count, 3, 3),
     }
     return torch.nn.ParameterDict({name: torch.nn.Parameter(value.to(device)) for name, value in values.items()})
 

@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import TINY
+from helpers.framework_runs import TINY, without_replaced
 from helpers.tolerances import PSNR_BOUND
 from PIL import Image
 
@@ -64,9 +64,7 @@ SHORT = (
 def small_config(capture: Path, *overrides: str) -> Config:
     """9 iterations with three densifications, a final pruning and three SH degrees; an override may change the type of
     a strategy."""
-    defaults = [*TINY, *SHORT]
-    replaced = tuple(override.partition("type=")[0] for override in overrides if ".type=" in override)
-    config = load_config("turbogs", [*(option for option in defaults if not option.startswith(replaced)), *overrides])
+    config = load_config("turbogs", [*without_replaced([*TINY, *SHORT], overrides), *overrides])
     config.scene.path = str(capture)
     return config
 
@@ -120,25 +118,19 @@ PHOTOS = {
     "white": lambda photo, number: 0 * photo + 255,
     "one colour": lambda photo, number: 0 * photo + np.array([120, 30, 200]),
     "exposures": exposures,
+    "one black photo": lambda photo, number: 0 * photo if number == 3 else photo,
     "noise": lambda photo, number: np.random.default_rng(number).integers(0, 256, photo.shape),
 }
 
 
-@pytest.mark.parametrize("name", ["black", "one colour", "exposures", "noise"])
+@pytest.mark.parametrize("name", PHOTOS)
 def test_photos_without_information(variant, tmp_path, name, drawn):
+    """With exposures, which end near the identity; those of black photos take no other photo's with them."""
     edit_photos(variant, PHOTOS[name])
     loss = "sparse_ssim" if name in ("one colour", "exposures") else "charbonnier_ncc"
-    outcome = train_to_the_end(variant, tmp_path / "run", f"loss.type={loss}")
+    outcome = train_to_the_end(variant, tmp_path / "run", "train.exposure=true", f"loss.type={loss}")
     if name in ("black", "one colour"):
         assert outcome.history[-1].psnr > outcome.history[0].psnr
-
-
-@pytest.mark.parametrize("name", [*PHOTOS, "one black photo"])
-def test_photos_with_exposures(variant, tmp_path, name):
-    """Exposures end near the identity, and those of black photos take no other photo's with them."""
-    change = PHOTOS.get(name, lambda photo, number: 0 * photo if number == 3 else photo)
-    edit_photos(variant, change)
-    outcome = train_to_the_end(variant, tmp_path / "run", "train.exposure=true")
     offsets = outcome.trainer.exposures.offsets
     assert offsets.isfinite().all() and offsets.abs().max() < 1.0
     assert offsets.mean(dim=0).abs().max() < 1e-5

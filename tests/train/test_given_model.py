@@ -214,11 +214,9 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         "absent": (folder / "absent.ply", "no such model"),
         "another kind": (written("model.obj", b"x"), "a .ply, .spz or gsplat's .pt"),
         "empty folder": (empty, "without a checkpoint of a run"),
-        "no archive": (written("text.pt", b"text"), "not a whole file of torch.save"),
         "other keys": (saved("weights.pt", {"conv1": torch.zeros(3), "bias": torch.zeros(1)}), "bias, conv1"),
         "code": (saved("code.pt", {"splats": Path("x")}), "more than plain tensors"),
         "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
-        "not a ply": (written("text.ply", b"text"), "not a .ply file"),
         "not a spz": (written("text.spz", b"text"), "cannot read"),
     }
 
