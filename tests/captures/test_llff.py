@@ -113,18 +113,16 @@ def set_at(row, column, value):
     return change_table(change)
 
 
-def drop_photos(folder: Path) -> None:
-    for file in (folder / "images").iterdir():
-        file.unlink()
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (change_table(lambda rows: rows[:, :15]), "not a readable table: 9x15 where N x 17 numbers .* imgs2poses.py"),
         (change_table(lambda rows: rows.astype(object)), "not a readable table"),
         (change_table(lambda rows: rows[:8]), "has 8 poses but .*images has 9 photos: .*take out those without"),
-        (drop_photos, "has 9 poses but .*images has 0 photos: bring back"),
+        (
+            lambda folder: [file.unlink() for file in (folder / "images").iterdir()],
+            "has 9 poses but .*images has 0 photos: bring back",
+        ),
         (set_at(3, 8, np.inf), "the pose in row 3 has numbers that are not finite: write it again"),
         (change_table(lambda rows: rows[:, [1, 0, *range(2, 17)]]), "the pose in row 0 is not a rotation"),
         (set_at(2, 14, np.nan), "row 2 has no positive height, width and focal length"),

@@ -209,7 +209,6 @@ def listed(*views: int) -> list[str]:
             "3 others not used): 6 photos, by its own split 4 for training, 2 for",
         ),
         ({"train": (0, 1, 2, 3), "val": (4, 5)}, "0123", "45", "3 others not used): 6 photos, "),
-        ({"train": (0, 1, 2, 3), "val": (4, 5), "test": ()}, "0123", "45", "3 others not used): 6"),
         ({"train": (8, 1, 2)}, "128", "034567", "by its own split 3 for training, 6 for testing"),
         ({"test": (8,)}, "01234567", "8", "by its own split 8 for training, 1 for testing"),
         ({"test": (8,), "val": (7,)}, "0123456", "8", "1 others not used): 8 photos"),
@@ -232,7 +231,6 @@ def test_lists_of_file_names_are_the_split(tmp_path, lists, train, test, said):
     ("content", "message"),
     [
         ({"test_filenames": ["images/f3.png", "images/g.png"]}, "test_filenames are no split: give lists"),
-        ({"val_filenames": "images/f3.png"}, "val_filenames are no split"),
         ({"train_filenames": listed(*range(9))}, "train_filenames.* are no split"),
         ({"train_filenames": listed(1, 2, 3), "test_filenames": listed(3, 4)}, "are no split"),
         ({"train_filenames": listed(1, 2), "test_filenames": listed(3, 4)}, "2 training images: at least 3"),

@@ -11,7 +11,6 @@ from turbogs_plugin.engine.reference import compositing, projection
 from turbogs_plugin.engine.render import dense_samples, rasterize, render_image
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianStats, PixelSamples
 
 SIZES = [(37, 29), (20, 50)]
@@ -165,17 +164,6 @@ def test_absolute_gradients_and_squares_are_those_of_single_pixels():
     squares = (torch.sigmoid(gaussians.opacities) * single[..., ScreenRecord.OPACITY]).square().sum(dim=0)
     assert squares.max() > 0
     torch.testing.assert_close(whole[:, ScreenRecord.SQUARE_SUM], squares)
-
-
-def test_autograd_gives_the_gradients_of_the_screen():
-    gaussians, cameras = make_gaussians(20), make_cameras([(6, 5)])
-    samples = dense_samples(cameras)
-    colors = upstream(samples)[0]
-    output = rasterize_differentiable(gaussians.map(lambda value: value.clone().requires_grad_()), cameras, samples)
-    output.colors.backward(colors)
-    record = rasterize(gaussians, cameras, samples).backward(colors, with_statistics=True).full_records()
-    torch.testing.assert_close(output.means2d.grad, record[..., ScreenRecord.MEAN])
-    torch.testing.assert_close(output.means2d.absgrad, record[..., ScreenRecord.ABSOLUTE])
 
 
 def test_statistics_are_added_once_as_documented():

@@ -115,18 +115,6 @@ def test_schedulers_set_the_rate_of_the_next_step():
     assert moves[1] / moves[0] == pytest.approx(0.5, rel=1e-3)
 
 
-def test_a_row_that_is_not_finite_is_left_out_and_counted():
-    splats = make_splats()
-    members = members_of(splats, MomentLMOptimizer())
-    set_gradients(splats, 0)
-    splats["quats"].grad[4] = float("nan")
-    before = splats["means"].detach().clone()
-    for member in members.values():
-        member.step()
-    assert torch.equal(splats["means"][4], before[4]) and not torch.equal(splats["means"][5], before[5])
-    assert int(members["means"].shared.skipped) == 1
-
-
 def test_a_missing_gradient_is_zero_and_none_at_all_is_no_step():
     splats = make_splats()
     members = members_of(splats, SparseAdam())

@@ -66,6 +66,14 @@ def looks_of_others() -> torch.Tensor:
         return sparse_rasterization(**truth, samples=dense_samples(cameras), sh_degree=1)[0]
 
 
+def optimizers_of(splats: torch.nn.ParameterDict, optimizer_class: Any) -> dict[str, Any]:
+    """As gsplat's trainer makes them."""
+    options = {"eps": 1e-15, "betas": (0.9, 0.999), "fused": True}
+    return {
+        name: optimizer_class([{"params": splats[name], "lr": RATES[name], "name": name}], **options) for name in splats
+    }
+
+
 @dataclass
 class Host:
     """A trainer that fits what other Gaussians look like, in the order of calls of gsplat's.
@@ -85,15 +93,7 @@ class Host:
         self.cameras = make_cameras(3)
         self.samples = dense_samples(self.cameras)
         self.pixels = looks_of_others()
-        self.optimizers = {
-            name: self.optimizer_class(
-                [{"params": self.splats[name], "lr": RATES[name], "name": name}],
-                eps=1e-15,
-                betas=(0.9, 0.999),
-                fused=True,
-            )
-            for name in self.splats
-        }
+        self.optimizers = optimizers_of(self.splats, self.optimizer_class)
         self.schedulers = [torch.optim.lr_scheduler.ExponentialLR(self.optimizers["means"], gamma=0.99)]
         self.strategy.check_sanity(self.splats, self.optimizers)
         self.state = self.strategy.initialize_state(scene_scale=1.0)

@@ -102,19 +102,3 @@ def all_finite(gaussians: Gaussians) -> bool:
 def equal(one: Gaussians, other: Gaussians) -> bool:
     """To the last bit."""
     return all(torch.equal(value, getattr(other, name)) for name, value in one.items())
-
-
-def assert_resumed_is_bit_identical(cls: type) -> None:
-    """Six steps of an optimizer at once, and with its state taken over by another one after three."""
-    whole, parts = make_gaussians(6, dtype=torch.float32), make_gaussians(6, dtype=torch.float32)
-    first, second, resumed = cls(), cls(), cls()
-    first.setup(whole)
-    second.setup(parts)
-    for seed in range(6):
-        gradients = make_gradients(3, 6, seed, torch.float32)
-        first.step(whole, gradients, STEP)
-        if seed == 3:
-            resumed.setup(parts)
-            resumed.load_state_dict(second.state_dict())
-        (second if seed < 3 else resumed).step(parts, gradients, STEP)
-    assert equal(whole, parts)

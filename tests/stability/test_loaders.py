@@ -35,9 +35,6 @@ def finished(capture, tmp_path_factory) -> Path:
     return run.train(tiny_config(capture, "train.iterations=3"), tmp_path_factory.mktemp("runs") / "run").folder.path
 
 
-# ---- Checkpoints -------------------------------------------------------------------------------------------------
-
-
 def leaves(value, path=()):
     """(path, leaf) of a nested state."""
     if isinstance(value, dict):
@@ -96,9 +93,6 @@ def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
     assert cases > 50 and refused > 0.6 * cases
 
 
-# ---- Text --------------------------------------------------------------------------------------------------------
-
-
 BOMBS = {
     "aliases": "a: &a [x]\n" + "".join(f"b{i}: &b{i} [*a, *a]\n" for i in range(50)),
     "tag": "a: !!python/object/apply:os.system ['true']",
@@ -113,9 +107,6 @@ BOMBS = {
 def test_yaml_bombs(tmp_path, name):
     (tmp_path / "bomb.yaml").write_text(BOMBS[name])
     assert isinstance(outcome_within(MEMORY, load_config, str(tmp_path / "bomb.yaml")), InputError)
-
-
-# ---- Captures ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["one byte", "cut", "other size", "text", "empty", "damaged"])

@@ -110,9 +110,6 @@ def test_other_values_in_files_of_frames(photos, kind):
     assert 20 < refused < 60
 
 
-# ---- Models to start from ----------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def scene(capture) -> Scene:
     return load_scene(capture, factor=4)

@@ -1,4 +1,4 @@
-"""Properties of samplers, maps and losses over arbitrary inputs."""
+"""Properties of samplers and maps over arbitrary inputs."""
 
 import numpy as np
 import torch
@@ -6,12 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
-from turbogs_plugin.strategies.losses import CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
-from turbogs_plugin.types import PixelSamples, Step
+from turbogs_plugin.types import Step
 
 ANY_ERROR = st.sampled_from([0.0, 6e-8, 1e-3, 0.3, 3.0, 65504.0, 1e30, float("inf"), float("-inf"), float("nan")])
-LEVELS = st.sampled_from([0.0, 1e-20, 1e-4, 0.5, 1.0, 1e4, -1e4, 1e6])
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
@@ -56,42 +54,3 @@ def test_training_on_any_errors_keeps_maps_and_samples_valid(
             assert maps.view_sums[view_id] == maps.errors[begin:end].double().sum()
             ages = maps.ages(view_id, step)
             assert ((ages >= 0) & (ages <= AGE_MAX)).all()
-
-
-@settings(max_examples=80, deadline=None, derandomize=True)
-@given(
-    counts=st.lists(st.integers(1, 40), min_size=1, max_size=4),
-    level=LEVELS,
-    contrast=LEVELS,
-    truth_level=st.sampled_from([0.0, 0.3, 1.0]),
-    truth_contrast=st.sampled_from([0.0, 1e-8, 1e-3, 1.0]),
-    structure=st.sampled_from(["ncc", "printed_ncc"]),
-    variance_constant=st.sampled_from([1e-8, 0.03**2]),
-    dtype=st.sampled_from([torch.float16, torch.float32, torch.float64]),
-    seed=st.integers(0, 2**32 - 1),
-)
-def test_gradients_of_any_tiles_are_finite_and_bounded(
-    counts, level, contrast, truth_level, truth_contrast, structure, variance_constant, dtype, seed
-):
-    generator = torch.Generator().manual_seed(seed)
-    slots = sum(counts)
-    noise, texture = torch.rand(2, slots, 3, generator=generator, dtype=torch.float64)
-    colors = (level + contrast * noise).to(dtype)
-    targets = (truth_level + truth_contrast * texture).to(dtype)
-    offsets = torch.tensor(np.concatenate([[0], np.cumsum(counts)]), dtype=torch.int32)
-    tiles = torch.arange(len(counts), dtype=torch.int32)
-    pixel_ids = torch.arange(slots, dtype=torch.int32)
-    samples = PixelSamples((0,), np.array([[16 * len(counts), 16]]), pixel_ids, tiles, offsets)
-
-    loss = CharbonnierNccLoss(ncc_weight=1.0, structure=structure, variance_constant=variance_constant)
-    result = loss(colors, targets, samples)
-    assert torch.isfinite(result.loss)
-    finite = torch.isfinite(colors).all(dim=1)  # half precision ends at 65504
-    assert torch.isfinite(result.pixel_errors).all()
-    assert (result.color_gradients[~finite] == 0).all()
-    bound = 1 / (3 * slots) + 1 / len(counts)
-    assert result.color_gradients.abs().max() <= 1.001 * bound
-
-    result = SparseSsimLoss()(colors, targets, samples)
-    assert torch.isfinite(result.loss)
-    assert torch.isfinite(result.color_gradients).all()

@@ -79,9 +79,6 @@ def train_to_the_end(capture: Path, out: Path, *overrides: str) -> run.RunSessio
     return outcome
 
 
-# ---- Coordinates -------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def unmoved(capture, tmp_path_factory) -> float:
     return coordinates_run(capture, tmp_path_factory.mktemp("unmoved") / "run")
@@ -97,15 +94,11 @@ STEADY = ("train.iterations=15", "view_sampler.type=random", "pixel_sampler.type
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e4, 0), (1.0, 1e6), (1e-4, 1e6)], ids=lambda value: f"{value:g}")
-def test_coordinates_of_the_world_do_not_matter(variant, tmp_path, unmoved, scale, shift, record_property):
+def test_coordinates_of_the_world_do_not_matter(variant, tmp_path, unmoved, scale, shift):
     move = pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.array([shift, -shift, shift], dtype=float))
     edit_model(variant, lambda reconstruction: reconstruction.transform(move))
     difference = coordinates_run(variant, tmp_path / "run") - unmoved
-    record_property("difference", f"{difference:.1e} dB")
     assert abs(difference) <= PSNR_BOUND
-
-
-# ---- Photos and cameras ------------------------------------------------------------------------------------------
 
 
 def exposures(photo: np.ndarray, number: int) -> np.ndarray:
@@ -196,9 +189,6 @@ def test_a_view_masked_whole(variant, tmp_path):
     trainer.require_finite()
 
 
-# ---- Settings ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("optimizer", "factor"),
     [
@@ -218,9 +208,8 @@ def test_learning_rates_far_too_large(capture, tmp_path, optimizer, factor):
     "overrides",
     [
         ("density.prune_score_fraction=0.999", "density.final_keep=1e-9"),
-        ("density.choose_by=squares", "density.prune_score_fraction=0.999", "density.final_keep=1e-9"),
+        ("density.choose_by=difficulty", "density.prune_score_fraction=0.999", "density.final_keep=1e-9"),
         ("density.max_gaussians=1",),
-        ("density.choose_by=squares", "density.max_gaussians=1"),
     ],
     ids=lambda overrides: overrides[0],
 )

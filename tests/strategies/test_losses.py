@@ -226,9 +226,6 @@ def test_a_flat_tile_scores_zero_as_printed_and_one_with_the_floor():
         assert (loss - l1).item() == pytest.approx(1.0 - score, abs=1e-6)
 
 
-# --- extremes -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("loss", EVERY, ids=repr)
 @pytest.mark.parametrize("scale", [1.0, 1e4])
 def test_truth_has_no_loss_and_no_gradient(loss, scale):

@@ -190,9 +190,6 @@ def test_a_cell_with_a_time_budget_is_trained_as_a_run_with_one(small, capture, 
     assert cell.planned["train.iterations"] != cell.settings["train.iterations"]
 
 
-# Several processes
-
-
 def test_two_workers_train_each_cell_once(small, tmp_path, monkeypatch, capfd):
     """Forked from a server that has torch, where the command starts Python; what they are told is pickled in both."""
     capture, server = tiny_capture(tmp_path), multiprocessing.get_context("forkserver")
@@ -232,9 +229,6 @@ def test_a_cell_that_another_process_trains_is_left_to_it_until_that_dies(small,
     other.join(60.0)
     assert run_study(load_ablation(str(small)), choice, folder.path) == []
     assert [result.key for result in folder.read_study().results] == [key]
-
-
-# Cells
 
 
 def test_the_digest_of_a_capture_is_of_names_and_sizes(capture):
