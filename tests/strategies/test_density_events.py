@@ -120,7 +120,7 @@ def test_an_event_ends_a_window_whether_it_changes_anything_or_not():
 
 def test_what_mcmc_adds_has_the_step_count_of_what_it_was_copied_from():
     """Some are dead and relocated first, onto others of which copies may be added as well."""
-    gaussians, added = model(), 5
+    gaussians, added = model(), COUNT // 20  # 5 %
     before = gaussians.sh0.clone()
     optimizer = MomentLMOptimizer()
     optimizer.setup(gaussians)
