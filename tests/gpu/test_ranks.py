@@ -89,7 +89,7 @@ OTHERS = {
     "mcmc": ("density.type=mcmc", "density.refine_start_iter=20", "density.refine_every=20"),
     "masked": ("density.refine_from=20", "density.refine_every=20"),
     "larger batch": ("density.refine_from=20", "density.refine_every=20", "train.batch_for=auto"),
-    "hosted": ("train.pixels_place=host", "density.refine_every=20"),
+    "hosted": ("train.pixels_place=host", "density.refine_from=20", "density.refine_every=20"),
 }
 
 

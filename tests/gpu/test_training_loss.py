@@ -150,7 +150,7 @@ def test_bad_colors_stay_out(bad, name):
     assert torch.isfinite(gradients).all() and not gradients[slots].any()
     assert gradients[torch.arange(len(samples)) != 5].abs().sum() > 0
     before = make_maps("cpu")
-    flat = before.flat_pixels(samples)
+    flat = samples.flat_pixels(before.offsets)
     assert torch.equal(maps.errors.cpu()[flat[slots]], before.errors[flat[slots]])
     assert (maps.stamps.cpu()[flat[slots]] == -1).all()
     assert (maps.stamps.cpu()[flat] == STEP.iteration).sum() == len(samples) - 3

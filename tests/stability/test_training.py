@@ -209,7 +209,7 @@ def test_learning_rates_far_too_large(capture, tmp_path, optimizer, factor):
     [
         ("density.prune_score_fraction=0.999", "density.final_keep=1e-9"),
         ("density.choose_by=difficulty", "density.prune_score_fraction=0.999", "density.final_keep=1e-9"),
-        ("density.max_gaussians=1",),
+        ("density.max_gaussians=2",),
     ],
     ids=lambda overrides: overrides[0],
 )
