@@ -76,7 +76,6 @@ STILL_LARGER = {
     "turbogs_plugin/{config,plan}": 1_503,
     "turbogs_plugin/train": 2_326,
     "turbogs_plugin/export": 745,
-    "tests": 24_980,
 }
 """Folder or modules above their budget -> lines that they have. They only shrink; within the budget, an entry goes."""
 
