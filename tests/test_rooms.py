@@ -76,20 +76,6 @@ STILL_LARGER = {
     "turbogs_plugin/{config,plan}": 1_503,
     "turbogs_plugin/train": 2_326,
     "turbogs_plugin/export": 745,
-    "tests": 24_980,
-}": 1_270,
-    "turbogs_plugin/engine": 4_970,
-    "turbogs_plugin/distributed": 1_255,
-    "turbogs_plugin/model": 1_160,
-    "turbogs_plugin/captures": 3_420,
-    "turbogs_plugin/{config,plan}": 1_760,
-    "turbogs_plugin/train": 2_550,
-    "turbogs_plugin/reconstruct": 855,
-    "turbogs_plugin/viewer": 865,
-    "turbogs_plugin/export": 760,
-    "turbogs_plugin/{commands,cli,doctor,__main__}": 855,
-    "strategies": 2_090,
-    "tests": 29_100,
 }
 """Folder or modules above their budget -> lines that they have. They only shrink; within the budget, an entry goes."""
 

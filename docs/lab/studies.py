@@ -56,7 +56,7 @@ def study_cells(study: str) -> dict[str, dict[str, Cells]]:
     record = read_json(f"{study}/results.json")
     baseline = record["baseline"] or next(iter(record["variants"]))
     found: dict[str, dict[str, Cells]] = {}
-    for capture in CAPTURES:
+    for capture in dict.fromkeys((*CAPTURES, *(cell["scene"] for cell in record["cells"]))):
         for variant in sorted(record["variants"], key=lambda name: name != baseline):  # stable
             cells = [cell for cell in record["cells"] if (cell["scene"], cell["variant"]) == (capture, variant)]
             if cells:
@@ -122,8 +122,8 @@ def table(head: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
 
 def by_capture(head: str, lines: Mapping[str, Mapping[str, str]]) -> str:
     """A table with a column a capture, of rows that have a cell for some captures."""
-    rows = [[name, *(cells.get(capture, "") for capture in CAPTURES)] for name, cells in lines.items()]
-    return table((head, *CAPTURES), rows)
+    captures = dict.fromkeys((*CAPTURES, *(capture for cells in lines.values() for capture in cells)))
+    return table((head, *captures), [[name, *(cells.get(of, "") for of in captures)] for name, cells in lines.items()])
 
 
 def duration(seconds: float) -> str:

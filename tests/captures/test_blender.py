@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.painted import painted_photo, require_points_at_their_pixels
+from helpers.painted import axes_of, painted_photo, require_points_at_their_pixels, seen_by
 from helpers.refusals import assert_refused
 from PIL import Image
 
@@ -21,22 +21,9 @@ SPLIT = {"train": 6, "val": 2, "test": 4}
 def camera_to_world(turn: float, height: float) -> np.ndarray:
     """[4, 4], as Blender has it: x right, y up, z backward; 4 from the origin, looking at it, z up."""
     backward = np.array([math.cos(turn) * math.cos(height), math.sin(turn) * math.cos(height), math.sin(height)])
-    right = np.cross([0.0, 0.0, 1.0], backward)
-    right /= np.linalg.norm(right)
     pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(backward, right), backward, 4.0 * backward], axis=1)
+    pose[:3] = np.c_[axes_of(backward).T, 4.0 * backward]
     return pose
-
-
-def seen_at(pose: np.ndarray) -> np.ndarray:
-    """[3, 2] where Blender's camera sees the points: y of the image points down, that of the camera up."""
-    right, up, backward, center = pose[:3].T
-    focal = 0.5 * SIZE[0] / math.tan(0.5 * ANGLE)
-    offsets = POINTS - center
-    depths = -offsets @ backward
-    return np.stack(
-        [0.5 * SIZE[0] + focal * offsets @ right / depths, 0.5 * SIZE[1] - focal * offsets @ up / depths], axis=1
-    )
 
 
 def write_blender(folder: Path, split: dict[str, int] = SPLIT) -> Path:
@@ -46,7 +33,8 @@ def write_blender(folder: Path, split: dict[str, int] = SPLIT) -> Path:
         frames = []
         for view in range(count):
             pose = camera_to_world(0.9 * view + 0.3 * number, 0.4 + 0.1 * number)
-            photo = painted_photo(SIZE, seen_at(pose))
+            focal = 0.5 * SIZE[0] / math.tan(0.5 * ANGLE)
+            photo = painted_photo(SIZE, seen_by(pose[:3, :3].T, pose[:3, 3], POINTS, focal, SIZE))
             alpha = np.where(photo.any(axis=2), 255, 0)[:, :, None].astype(np.uint8)
             rgba = np.concatenate([np.where(alpha > 0, photo, 255).astype(np.uint8), alpha], axis=2)
             Image.fromarray(rgba).save(folder / part / f"r_{view}.png")

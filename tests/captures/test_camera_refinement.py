@@ -98,13 +98,6 @@ def test_of_several_processes_the_first_one_refines_for_all(capture):
     assert second.test.refined.Ks.equal(first.test.refined.Ks)
 
 
-def test_training_photos_tell_how_far_the_camera_of_a_test_photo_may_be(tmp_path):
-    """Of one lens for all photos, with much noise: alone, a test photo's intrinsics would change by more than 1."""
-    scene = load_scene(write_tracked(tmp_path / "cup", tracked(views=24, points=60, noise=0.5, shift=0.0)))
-    refined = refine_cameras(scene, training=False).test
-    assert (refined.refined.Ks - refined.cameras.Ks).abs().max() < 0.4
-
-
 @pytest.mark.parametrize("other", [True, False])
 def test_observations_of_other_photos_are_not_used(capture, other):
     """A reconstruction whose cameras were edited by hand for photos of another size, or that does not say any."""

@@ -15,6 +15,7 @@ from PIL import Image
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import find_model, read_colmap
+from turbogs_plugin.captures.kinds import holds_photos_alone
 from turbogs_plugin.errors import InputError
 
 
@@ -65,21 +66,8 @@ def test_reduced_copies_are_used_only_where_all_fit(tmp_path, case):
     assert scene.train.cameras.sizes[0].tolist() == [20, 12]
 
 
-def replace_photo(folder: Path, content: bytes) -> None:
-    (folder / "images" / "photo03.png").write_bytes(content)
-
-
-def truncate_photo(folder: Path) -> None:
-    path = folder / "images" / "photo03.png"
-    path.write_bytes(path.read_bytes()[:60])
-
-
-def wrong_size(folder: Path) -> None:
-    Image.new("RGB", (24, 40)).save(folder / "images" / "photo03.png")
-
-
-def deep_photo(folder: Path) -> None:
-    Image.fromarray(np.full((24, 40), 3000, dtype=np.uint16)).save(folder / "images" / "photo03.png")
+DEEP, WRONG = Image.fromarray(np.full((24, 40), 3000, dtype=np.uint16)), Image.new("RGB", (24, 40))
+"""Photos of 16 bits, and of another size than their camera's."""
 
 
 def remove_photos(folder: Path) -> None:
@@ -87,20 +75,20 @@ def remove_photos(folder: Path) -> None:
         (folder / "images" / f"photo{view:02d}.png").unlink()
 
 
-def remove_model(folder: Path) -> None:
-    (folder / "sparse/0/points3D.bin").unlink()
-
-
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (remove_model, r"has no points3D\.bin: bring back what is missing, or take that folder away and find"),
+        (
+            lambda folder: (folder / "sparse/0/points3D.bin").unlink(),
+            r"has no points3D\.bin: bring back what is missing, or take that folder away and find",
+        ),
         (remove_photos, r"sparse/0 names 9 photos, of which 7 are missing in .*cup \(photo02.png, .*\): at least 3"),
-        (lambda folder: replace_photo(folder, b"\xff"), "cannot read the photo .*photo03.png"),
-        (lambda folder: replace_photo(folder, b""), "cannot read the photo .*photo03.png"),
-        (truncate_photo, "cannot read the photo .*photo03.png"),
-        (wrong_size, "photo03.png is 24x40 but its camera is 40x24: it was cropped or turned"),
-        (deep_photo, "photo03.png has more than 8 bits a channel"),
+        (lambda folder: (folder / "images/photo03.png").write_bytes(b"\xff"), "cannot read the photo .*photo03.png"),
+        (
+            lambda folder: WRONG.save(folder / "images/photo03.png"),
+            "photo03.png is 24x40 but its camera is 40x24: it was cropped or turned",
+        ),
+        (lambda folder: DEEP.save(folder / "images/photo03.png"), "photo03.png has more than 8 bits a channel"),
     ],
 )
 def test_bad_files_are_named(tmp_path, damage, words):
@@ -115,7 +103,6 @@ def test_bad_files_are_named(tmp_path, damage, words):
         ({"views": 2}, {}, "has 2 images: at least 3"),
         ({}, {"test_every": 1}, "every image of .* would be a test image"),
         ({}, {"test_every": 0}, "test_every is 0"),
-        ({}, {"factor": 0}, "factor is 0"),
         ({}, {"factor": 2.5}, "factor is 2.5"),
         ({"cameras": (("PINHOLE", 40, 24, [np.nan, 52.0, 21.0, 11.0]),)}, {}, "intrinsics|VerifyParams"),
     ],
@@ -123,6 +110,15 @@ def test_bad_files_are_named(tmp_path, damage, words):
 def test_bad_captures_are_refused(tmp_path, capture, arguments, words):
     folder = write_capture(tmp_path / "cup", **capture)
     assert_refused(words, load_scene, folder, **arguments)
+
+
+def test_photos_of_a_capture_name_the_capture(tmp_path, monkeypatch):
+    folder = write_capture(tmp_path / "far/from/others/cup")
+    photos = folder / "images"
+    monkeypatch.chdir(photos)
+    for given in (photos, Path()):
+        assert not holds_photos_alone(given)
+        assert_refused(f"{re.escape(str(given))} lies in the capture {folder}: give that folder", load_scene, given)
 
 
 def test_without_points_random_ones_are_drawn(tmp_path):

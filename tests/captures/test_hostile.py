@@ -7,17 +7,16 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-import torch
-from helpers.bounded_memory import outcome_within
+from helpers.bounded_memory import damaged, outcome_within
 from helpers.framework_runs import thin_out_points
+from helpers.models import random_gaussians
 
 from turbogs_plugin.captures import write_demo_capture
 from turbogs_plugin.captures.colmap import read_colmap
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.ply import read_ply, save_ply
-from turbogs_plugin.types import Gaussians
 
-NAN, INF, HUGE = struct.pack("<d", np.nan), struct.pack("<d", np.inf), struct.pack("<Q", 2**60)
+NAN, INF = struct.pack("<d", np.nan), struct.pack("<d", np.inf)
 FILES = ("cameras", "images", "points3D", "rigs", "frames")
 MEMORY = 32 * 2**20
 """Python and numpy may allocate this much for files of some 50 kB, however large their counts."""
@@ -35,30 +34,9 @@ def capture(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def model_ply(tmp_path_factory) -> Path:
-    generator = torch.Generator().manual_seed(0)
-    shapes = {"means": (30, 3), "quats": (30, 4), "scales": (30, 3), "opacities": (30,), "sh0": (30, 1, 3)}
-    values = {name: torch.randn(shape, generator=generator) for name, shape in shapes.items()}
     path = tmp_path_factory.mktemp("ply") / "model.ply"
-    save_ply(Gaussians(**values, shN=torch.randn(30, 3, 3, generator=generator)), path)
+    save_ply(random_gaussians(30, sh_degree=1), path)
     return path
-
-
-def mutate(content: bytes, choice: random.Random) -> bytes:
-    """Cut, overwritten in some bytes, with a hostile number in it, or with a piece moved into it."""
-    data = bytearray(content)
-    kind, place = choice.randrange(4), choice.randrange(len(data))
-    if kind == 0:
-        del data[place:]
-    elif kind == 1:
-        for _ in range(choice.choice([1, 1, 4])):
-            data[choice.randrange(len(data))] = choice.randrange(256)
-    elif kind == 2:
-        place = choice.choice([0, 8, 12, 16, 24, place])
-        data[place : place + 8] = choice.choice([b"\xff" * 8, HUGE, bytes(8), NAN, INF])
-    else:
-        source = choice.randrange(len(data))
-        data[place:place] = data[source : source + choice.randrange(64)]
-    return bytes(data)
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
@@ -72,7 +50,7 @@ def test_mutated_models(capture, tmp_path, file, suffix):
     target = tmp_path / f"{file}{suffix}"
     content, errors, cases = target.read_bytes(), 0, 60
     for _ in range(cases):
-        target.write_bytes(mutate(content, choice))
+        target.write_bytes(damaged(content, choice))
         result = outcome_within(MEMORY, read_colmap, capture, tmp_path, suffix)
         if isinstance(result, InputError):
             errors += 1
@@ -87,12 +65,10 @@ def test_mutated_models(capture, tmp_path, file, suffix):
     [
         ("images", 8 + 4, NAN, "image 1 has a pose that is not finite"),
         ("images", 8 + 4, bytes(32), "damaged: .* zero rotation; copy or reconstruct it again"),
-        ("images", 8 + 4 + 32, INF, "image 1 has a pose that is not finite"),
         ("frames", 8 + 8 + 32, NAN, "frame 1 has a pose that is not finite"),
         ("points3D", 8 + 8, NAN, "1 of .* 3D points are not finite: export or reconstruct it again"),
         ("images", 8 + 60, struct.pack("<I", 7), "has camera 7, which"),
         ("cameras", 8 + 4, struct.pack("<i", 99), "unknown model 99"),
-        ("cameras", 8 + 8, struct.pack("<Q", 2**60), "is 1152921504606846976x24 pixels"),
         ("cameras", 8 + 8, struct.pack("<Q", 10**6), "a size outside 1 .. 65535 .*: export or reconstruct it"),
         ("cameras", 8 + 24, struct.pack("<d", -5.0), "positive focal lengths|not a COLMAP"),
     ],
@@ -112,7 +88,6 @@ def test_bad_values(capture, tmp_path, file, place, replacement, words):
     ("old", "new", "words"),
     [
         (b"element vertex 30", b"element vertex 1152921504606846976", "not a whole .ply file"),
-        (b"element vertex 30", b"element vertex 31", "not a whole .ply file"),
         (b"element vertex 30", b"element vertex -1", "not a whole .ply file"),
         (b"property float x", b"property list uchar int x", "not a whole .ply file"),
         (b"property float nx", b"property float f_rest_9", "10 properties f_rest_"),

@@ -68,15 +68,12 @@ def test_a_nonzero_pixel_counts(capture, convention, mode):
     assert scene.notes[-1] == "8 photos have masked pixels, 49.9% of them"
 
 
-def left_half_as_jpeg(path: Path) -> None:
-    path.parent.mkdir(exist_ok=True)
-    Image.fromarray(np.where(half_mask() > 1, np.uint8(255), np.uint8(0))).save(path, format="JPEG")
-
-
 @pytest.mark.parametrize("suffix", [".jpg", ".jpeg", ".JPG", ".JPEG"])
 def test_masks_are_jpegs_too(capture, suffix):
+    (capture / "masks").mkdir()
     for photo in photos_of(capture):
-        left_half_as_jpeg(capture / "masks" / f"{photo.stem}{suffix}")
+        mask = Image.fromarray(np.where(half_mask() > 1, np.uint8(255), np.uint8(0)))
+        mask.save(capture / "masks" / f"{photo.stem}{suffix}", format="JPEG")
     assert_masked(load_scene(capture).train, half_mask() > 1)
 
 
@@ -127,15 +124,6 @@ def test_a_mask_of_another_size_is_refused(capture):
     photo = photos_of(capture)[2]
     write_masks(capture, [f"{photo.stem}.png"], half_mask((24, 20)))
     with pytest.raises(InputError, match=rf"mask .*{photo.stem}.png is 24x20 but photo .*{photo.name} is 48x40: make"):
-        load_scene(capture)
-
-
-@pytest.mark.parametrize("content", [b"", b"no mask", b"\x89PNG\r\n\x1a\n\x00"])
-def test_an_unreadable_mask_is_named(capture, content):
-    (capture / "masks").mkdir()
-    name = f"{photos_of(capture)[2].stem}.png"
-    (capture / "masks" / name).write_bytes(content)
-    with pytest.raises(InputError, match=rf"cannot read the mask .*{name}: "):
         load_scene(capture)
 
 

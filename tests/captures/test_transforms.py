@@ -69,10 +69,8 @@ def set_pose(value):
     [
         (lambda content: content.update(camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR': known are OPENCV"),
         (lambda content: content.update(k4=0.1, k5=0.1), "f0.png has k4 and k5, which OPENCV does not"),
-        (lambda content: content.update(is_fisheye=True, p1=0.1, p2=0.1), "has p1 and p2, which OPENCV_FISHEYE"),
         (lambda content: content.update(k1="much"), "k1 is 'much': it must be a finite number"),
         (lambda content: content["frames"][4].update(k1=-1e9), "f4.png is OPENCV with parameters that are not those"),
-        (lambda content: content.update(fl_x=-1.0), "positive focal lengths .*: export or reconstruct it again"),
         (lambda content: content.pop("fl_x"), "neither fl_x nor a camera_angle_x"),
         (lambda content: content.update(w=2**60), "camera of f0.png is .*: write the photo's size as w and h"),
         (lambda content: content.update(frames=3), "no list of frames"),
@@ -83,7 +81,6 @@ def set_pose(value):
         ),
         (lambda content: content.update(ply_file_path="../points.ply"), "'../points.ply', is not there: bring it back"),
         (set_pose(None), "f2.png' is no matrix of 4x4 numbers"),
-        (set_pose((np.eye(4) * math.nan).tolist()), "f2.png' has numbers that are not finite"),
         (set_pose(np.diag([1, 1, -1, 1]).tolist()), "f2.png' is not a rotation"),
     ],
 )
@@ -212,7 +209,6 @@ def listed(*views: int) -> list[str]:
             "3 others not used): 6 photos, by its own split 4 for training, 2 for",
         ),
         ({"train": (0, 1, 2, 3), "val": (4, 5)}, "0123", "45", "3 others not used): 6 photos, "),
-        ({"train": (0, 1, 2, 3), "val": (4, 5), "test": ()}, "0123", "45", "3 others not used): 6"),
         ({"train": (8, 1, 2)}, "128", "034567", "by its own split 3 for training, 6 for testing"),
         ({"test": (8,)}, "01234567", "8", "by its own split 8 for training, 1 for testing"),
         ({"test": (8,), "val": (7,)}, "0123456", "8", "1 others not used): 8 photos"),
@@ -235,7 +231,6 @@ def test_lists_of_file_names_are_the_split(tmp_path, lists, train, test, said):
     ("content", "message"),
     [
         ({"test_filenames": ["images/f3.png", "images/g.png"]}, "test_filenames are no split: give lists"),
-        ({"val_filenames": "images/f3.png"}, "val_filenames are no split"),
         ({"train_filenames": listed(*range(9))}, "train_filenames.* are no split"),
         ({"train_filenames": listed(1, 2, 3), "test_filenames": listed(3, 4)}, "are no split"),
         ({"train_filenames": listed(1, 2), "test_filenames": listed(3, 4)}, "2 training images: at least 3"),

@@ -241,9 +241,6 @@ def test_the_command_starts_processes_itself(capture, tmp_path, turbogs, monkeyp
     assert distributed_processes.start(2, ["2"], "cpu", "ending") == 2
 
 
-# A launcher that is lost
-
-
 def state(process: int) -> tuple[str, int]:
     """(letter, parent) of a process; X where there is none. One that ended and was not yet waited for is a Z."""
     try:

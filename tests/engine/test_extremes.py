@@ -1,6 +1,5 @@
 """Stiff and extreme Gaussians, cameras and images: finite outputs and gradients, and the stated behaviour."""
 
-import numpy as np
 import pytest
 import torch
 from helpers.rendering_scenes import make_cameras, make_gaussians
@@ -98,18 +97,6 @@ def test_few_gaussians_and_odd_images(count, size):
     assert len(rendered.colors) == size[0] * size[1]
     assert bool((rendered.alphas > 0).any()) == (count == 1)
     assert gradients.means.shape == (1, count, 3)
-
-
-def test_a_gaussian_in_a_pixel_centre_shows_its_opacity():
-    gaussians, cameras = scene(1), make_cameras([(9, 9)], torch.float32)
-    cameras.viewmats[0] = torch.eye(4)
-    cameras.Ks[0, :2, 2] = 4.5
-    gaussians.means[0] = torch.tensor([0.0, 0.0, 3.0])
-    gaussians.opacities[0] = 1.0
-    rendered, _ = render_and_check(gaussians, cameras)
-    samples = dense_samples(cameras)
-    center = (samples.pixel_ids == 4 * 9 + 4).nonzero()[0, 0]
-    np.testing.assert_allclose(rendered.alphas[center], 1 / (1 + np.exp(-1.0)), rtol=1e-6)
 
 
 def test_equal_depths_render_the_same_every_time_and_in_order():

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
+from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows, rotation_matrices
-from turbogs_plugin.engine.reference.spherical_harmonics import evaluate, unit_directions
+from turbogs_plugin.engine.reference.spherical_harmonics import unit_directions
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.types import Gaussians
 
@@ -19,16 +19,6 @@ SETTINGS = RasterSettings()
 def project(gaussians: Gaussians, cameras, degree: int = 3, settings: RasterSettings = SETTINGS):
     rows = drawable_rows(gaussians, cameras, settings)
     return rows, project_rows(rows, rows.take(gaussians), cameras, degree, settings)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_spherical_harmonics_are_gsplats(degree):
-    generator = torch.Generator().manual_seed(degree)
-    offsets = torch.randn(50, 3, generator=generator, dtype=torch.float64)
-    coefficients = torch.randn(50, 16, 3, generator=generator, dtype=torch.float64)
-    ours = evaluate(coefficients[:, :1], coefficients[:, 1:], unit_directions(offsets), degree)
-    theirs = _spherical_harmonics(degree, offsets, coefficients)
-    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-13)
 
 
 def test_direction_of_no_offset_is_zero_with_no_gradient():

@@ -5,15 +5,13 @@ import pytest
 import torch
 from helpers.gsplat_torch import Drawn, gsplat_torch_render
 from helpers.rendering_scenes import dense_on_grid, make_cameras, make_gaussians, thin_out
-from torch.autograd.function import once_differentiable
 
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference import compositing, projection
 from turbogs_plugin.engine.render import dense_samples, rasterize, render_image
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
-from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, PixelSamples
+from turbogs_plugin.types import PARAMETER_NAMES, GaussianStats, PixelSamples
 
 SIZES = [(37, 29), (20, 50)]
 ACTIVATED = {"opaque": 5.0, "as made": 0.0}
@@ -96,38 +94,6 @@ def test_what_lies_behind_the_end_of_a_pixel_has_no_gradient_at_all():
         assert float(getattr(gradients, name)[:, ~gradients.touched].abs().max()) == 0
 
 
-class RenderAgain(torch.autograd.Function):
-    """A pass whose backward renders again: `gradcheck` goes backward many times, which one pass refuses."""
-
-    @staticmethod
-    def forward(ctx, cameras, samples, *parameters):
-        ctx.cameras, ctx.samples = cameras, samples
-        ctx.save_for_backward(*parameters)
-        return RenderAgain.render(cameras, samples, parameters)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *gradients):
-        leaves = [value.detach().requires_grad_() for value in ctx.saved_tensors]
-        with torch.enable_grad():
-            outputs = RenderAgain.render(ctx.cameras, ctx.samples, leaves)
-        return None, None, *torch.autograd.grad(outputs, leaves, gradients)
-
-    @staticmethod
-    def render(cameras, samples, parameters):
-        output = rasterize_differentiable(Gaussians(*parameters), cameras, samples, with_depth=True)
-        return output.colors, output.alphas, output.depths
-
-
-def test_gradcheck_through_everything():
-    gaussians, cameras = make_gaussians(3, seed=3, degree=1), make_cameras([(9, 7), (8, 18)])  # further bands: below
-    gaussians.sh0.add_(1.5)  # away from the clamp of colours at zero
-    samples = thin_out(dense_samples(cameras), 0.04, empty_slots=1)
-
-    parameters = [value.clone().requires_grad_() for _, value in gaussians.items()]
-    assert torch.autograd.gradcheck(RenderAgain.apply, (cameras, samples, *parameters), eps=1e-7, atol=1e-6)
-
-
 @pytest.mark.parametrize("opacity", ACTIVATED)
 def test_values_and_gradients_are_those_of_gsplats_torch_code_and_rows_sum_to_them(opacity):
     """By autograd through gsplat's projection; depth is along the camera's axis, as there."""
@@ -198,17 +164,6 @@ def test_absolute_gradients_and_squares_are_those_of_single_pixels():
     squares = (torch.sigmoid(gaussians.opacities) * single[..., ScreenRecord.OPACITY]).square().sum(dim=0)
     assert squares.max() > 0
     torch.testing.assert_close(whole[:, ScreenRecord.SQUARE_SUM], squares)
-
-
-def test_autograd_gives_the_gradients_of_the_screen():
-    gaussians, cameras = make_gaussians(20), make_cameras([(6, 5)])
-    samples = dense_samples(cameras)
-    colors = upstream(samples)[0]
-    output = rasterize_differentiable(gaussians.map(lambda value: value.clone().requires_grad_()), cameras, samples)
-    output.colors.backward(colors)
-    record = rasterize(gaussians, cameras, samples).backward(colors, with_statistics=True).full_records()
-    torch.testing.assert_close(output.means2d.grad, record[..., ScreenRecord.MEAN])
-    torch.testing.assert_close(output.means2d.absgrad, record[..., ScreenRecord.ABSOLUTE])
 
 
 def test_statistics_are_added_once_as_documented():
@@ -341,16 +296,7 @@ def test_settings_are_used():
 
 
 @pytest.mark.parametrize(
-    "values",
-    [
-        {"eps2d": -0.1},
-        {"eps2d": np.inf},
-        {"near_plane": 0.0},
-        {"near_plane": np.nan},
-        {"transmittance_min": 0.0},
-        {"transmittance_min": 1.0},
-    ],
-    ids=str,
+    "values", [{"eps2d": -0.1}, {"eps2d": np.inf}, {"near_plane": np.nan}, {"transmittance_min": 1.0}], ids=str
 )
 def test_settings_out_of_bounds_are_refused(values):
     with pytest.raises(InputError, match=f"{list(values)[-1]} = "):

@@ -6,24 +6,20 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import tiny_capture
+from helpers.raster_cases import GPU_ONLY
 from helpers.synthetic_capture import surface_gaussians
 
 from turbogs_plugin.bench.raster import STAGES, bench_raster
 from turbogs_plugin.bench.step import bench_step
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.engine.cuda import library as kernels
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(bool(kernels.unavailable_reason()), reason=kernels.unavailable_reason() or "usable"),
-]
+pytestmark = GPU_ONLY
 
 GPU = torch.device("cuda")
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    pytest.importorskip("pycolmap", reason="the capture is written by pycolmap")
     loaded = load_scene(tiny_capture(tmp_path_factory.mktemp("bench")))
     return replace(loaded, train=loaded.train.to(GPU), test=loaded.test.to(GPU))
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from gsplat import MCMCStrategy, rasterization
-from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
+from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_splats, optimizers_of
 from helpers.raster_cases import GPU_ONLY
 
 from turbogs_plugin.engine.render import dense_samples
@@ -104,15 +104,6 @@ def test_the_zero_channel_gives_our_error_sums(packed):
             assert relative(getattr(actual, name), getattr(expected, name)) < 5e-3, name
     assert relative(loss_shares(their_info, COUNT), loss_shares(our_info, COUNT)) < 5e-3
     assert torch.equal(splats["means"].grad, gradient)
-
-
-def optimizers_of(splats, optimizer_class):
-    return {
-        name: optimizer_class(
-            [{"params": splats[name], "lr": RATES[name], "name": name}], eps=1e-15, betas=(0.9, 0.999), fused=True
-        )
-        for name in splats
-    }
 
 
 def train(strategy, optimizer_class, packed: bool, tells_errors: bool, steps: int = 12) -> tuple[list[float], dict]:

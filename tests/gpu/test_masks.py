@@ -13,6 +13,7 @@ from helpers.raster_cases import (
     assert_gradients_close,
     make_case,
     on_gpu,
+    samples_to,
     upstream,
 )
 from PIL import Image
@@ -142,9 +143,7 @@ def test_the_loss_composites_transparent_photos(unit, loss):
     largest = float(expected.color_gradients.abs().max())
     torch.testing.assert_close(found.color_gradients, expected.color_gradients, rtol=1e-5, atol=1e-4 * largest)
     torch.testing.assert_close(found.pixel_errors, expected.pixel_errors, rtol=1e-6, atol=5e-7)
-    moved = replace(
-        samples, **{name: getattr(samples, name).cpu() for name in ("pixel_ids", "tile_ids", "tile_offsets")}
-    )
+    moved = samples_to(samples, "cpu")
     twin = sparse_loss(terms, rendered.cpu().double(), photos.at(moved, COLOR).colors().double(), moved)
     assert float(found.loss) == pytest.approx(float(twin.loss), rel=1e-5)
     masked = torch.cat([~mask.reshape(-1) for mask in masks()])

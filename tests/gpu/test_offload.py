@@ -103,7 +103,7 @@ def test_iterations_that_do_nothing_leave_the_maps_alone(scene, monkeypatch):
 
 def test_a_capture_larger_than_the_limit_trains_within_it():
     """200 photos of 3840x2160: 10 GB of maps and photos in 6 GiB, beside everything else."""
-    scene = synthetic_scene(200, 3840, 2160, GPU)
+    scene = synthetic_scene(200, 3840, 2160, GPU, gaussians=207_360)
     torch.cuda.empty_cache()
     asked = config_of(f"budget.max_memory={LIMIT}", *EVENTS)
     limit = asked.budget.memory_bytes()
@@ -124,15 +124,10 @@ def test_a_capture_larger_than_the_limit_trains_within_it():
         first = trainer.maps.view_means().mean()
         run(trainer, 30)
         test = place_views(scene.test, GPU, "host")
-        metrics = evaluate(trainer.gaussians, test, trainer.look(test.names))
+        evaluate(trainer.gaussians, test, trainer.look(test.names))
         assert torch.cuda.max_memory_reserved() <= limit
         assert len(trainer.gaussians) <= config.density["max_gaussians"]
         trainer.maps._means.restart()
         assert trainer.maps.view_means().mean() < first
-        print(
-            f"\nallocated at most {torch.cuda.max_memory_allocated() / 2**30:.2f} GiB, reserved "
-            f"{torch.cuda.max_memory_reserved() / 2**30:.2f} GiB of {LIMIT}; cap {config.density['max_gaussians']}, "
-            f"{len(trainer.gaussians)} Gaussians; PSNR {metrics.mean.psnr:.2f}"
-        )
     finally:
         torch.cuda.set_per_process_memory_fraction(1.0)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.raster_cases import GPU_ONLY
 from helpers.synthetic_capture import synthetic_scene
 from PIL import Image
 
@@ -20,16 +21,12 @@ from turbogs_plugin.captures import write_demo_capture
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed.processes import start
 from turbogs_plugin.distributed.shares import shares_of
-from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenRecords
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.trainer import Trainer
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(bool(kernels.unavailable_reason()), reason="needs a GPU and the kernels"),
-]
+pytestmark = GPU_ONLY
 
 GPU = torch.device("cuda")
 
@@ -92,7 +89,7 @@ OTHERS = {
     "mcmc": ("density.type=mcmc", "density.refine_start_iter=20", "density.refine_every=20"),
     "masked": ("density.refine_from=20", "density.refine_every=20"),
     "larger batch": ("density.refine_from=20", "density.refine_every=20", "train.batch_for=auto"),
-    "hosted": ("train.pixels_place=host", "density.refine_every=20"),
+    "hosted": ("train.pixels_place=host", "density.refine_from=20", "density.refine_every=20"),
 }
 
 

@@ -1,4 +1,4 @@
-"""The CUDA rasterizer against the reference in float64: forward, screen records, parameter gradients, autograd."""
+"""The CUDA rasterizer against the reference in float64: forward, screen records, parameter gradients."""
 
 import pytest
 import torch
@@ -16,7 +16,6 @@ from turbogs_plugin.engine.cuda import raster as cuda
 from turbogs_plugin.engine.reference.raster import kept, rasterize_reference
 from turbogs_plugin.engine.render_pass import RenderOptions
 from turbogs_plugin.engine.rules import NO_DROPOUT, Dropout
-from turbogs_plugin.gsplat_bridge.autograd import rasterize_differentiable
 from turbogs_plugin.types import GaussianStats
 
 pytestmark = GPU_ONLY
@@ -116,30 +115,6 @@ def test_parameter_gradients(case):
     assert (gradients.touched.cpu() != wanted_gradients.touched).double().mean() <= 1e-2
     for name in ("error_sums", "distance_sums", "weight_sums", "grad_sums", "absgrad_sums", "square_sums"):
         assert_gradients_close(getattr(stats, name)[:, None], getattr(wanted_stats, name)[:, None], name)
-
-
-def test_autograd(case):
-    """A user's own loss in plain torch, with colours, alphas and depths."""
-    gpu = case.gpu_gaussians.map(lambda value: value.clone().requires_grad_())
-    cpu = case.gaussians.map(lambda value: value.clone().requires_grad_())
-    values = upstream(case)
-    renders = (
-        (
-            rasterize_differentiable(gpu, case.gpu_cameras, case.gpu_samples, with_depth=True),
-            on_gpu(values),
-        ),
-        (rasterize_differentiable(cpu, case.cameras, case.samples, with_depth=True), values),
-    )
-    for render, weights in renders:
-        loss = (render.colors.square() * weights["color_gradients"]).sum()
-        loss = loss + (render.alphas * weights["alpha_gradients"]).sum()
-        (loss + (render.depths * weights["depth_gradients"]).sum()).backward()
-    ours, theirs = renders[0][0], renders[1][0]
-    assert_gradients_close(ours.means2d.grad, theirs.means2d.grad, "means2d")
-    assert_gradients_close(ours.means2d.absgrad, theirs.means2d.absgrad, "absgrad")
-    for name, value in cpu.items():
-        got = getattr(gpu, name).grad
-        assert_gradients_close(got.reshape(len(case.gaussians), -1), value.grad.reshape(len(got), -1), name)
 
 
 @pytest.mark.parametrize("warps", [1, 2, 3, 5, 8])

@@ -25,19 +25,11 @@ def equal_depths(count, generator):
     return torch.full((count,), 3.0)
 
 
-def two_depths(count, generator):
-    return torch.where(torch.rand(count, generator=generator) < 0.5, 2.0, 3.0)
-
-
 def close_depths(count, generator):
     """Neighbours in the last places, and one far splat that takes the leading bits of the range."""
     depths = 3.0 + torch.randint(0, max(2, count // 2), (count,), generator=generator) * 2.4e-7
     depths[0] = 1e9
     return depths
-
-
-def falling_depths(count, generator):
-    return torch.linspace(9, 1, count)
 
 
 def intersections_of_tiles(rendered):
@@ -55,7 +47,7 @@ def render(gaussians, cameras, samples):
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize(
     "depths",
-    [random_depths, equal_depths, two_depths, close_depths, falling_depths],
+    [random_depths, equal_depths, close_depths],
     ids=lambda depths: depths.__name__,
 )
 def test_a_tile_is_in_order(depths, count):

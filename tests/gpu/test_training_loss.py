@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.raster_cases import GPU_ONLY, on_side_stream
+from helpers.raster_cases import GPU_ONLY, on_side_stream, samples_to
 
 from turbogs_plugin.engine.cuda import training as training_kernels
 from turbogs_plugin.engine.protocol import MapUpdate
@@ -41,12 +41,6 @@ def make_samples(rate, unit="pixel", importance=0.0, views=(2, 0)):
     return draw_pixels(DrawRule(unit, 0.4, 0.3, False, importance), maps, views, rate, Step(3, 4, 4))
 
 
-def to_device(samples):
-    moved = {name: getattr(samples, name).to(DEVICE) for name in ("pixel_ids", "tile_ids", "tile_offsets")}
-    weights = None if samples.weights is None else samples.weights.to(DEVICE)
-    return replace(samples, **moved, weights=weights)
-
-
 def make_colors(samples, seed=0):
     """Predictions and uint8 photos; some tiles constant in one or both, where NCC has no information."""
     generator = torch.Generator().manual_seed(seed)
@@ -74,7 +68,9 @@ def test_equals_the_twin(name, rate, unit, importance):
     colors, targets, photos = make_colors(samples)
     expected = sparse_loss(terms, colors.double(), targets.double(), samples)
     for truth, extra in ((targets, {}), (photos, {"update": MapUpdate(make_maps(DEVICE), STEP)})):
-        found = training_kernels.sparse_loss(terms, colors.to(DEVICE), truth.to(DEVICE), to_device(samples), **extra)
+        found = training_kernels.sparse_loss(
+            terms, colors.to(DEVICE), truth.to(DEVICE), samples_to(samples, DEVICE), **extra
+        )
         assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
         assert relative(found.color_gradients, expected.color_gradients) < 1e-5
         assert not found.color_gradients.cpu()[~samples.filled].any()
@@ -90,7 +86,7 @@ def test_windows_of_tiles_with_one_sample_or_none():
     colors, targets, _ = make_colors(samples)
     terms = CASES["ssim"].terms
     expected = sparse_loss(terms, colors.double(), targets.double(), samples)
-    found = training_kernels.sparse_loss(terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples))
+    found = training_kernels.sparse_loss(terms, colors.to(DEVICE), targets.to(DEVICE), samples_to(samples, DEVICE))
     assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
     assert relative(found.color_gradients, expected.color_gradients) < 1e-5
     assert not found.color_gradients.cpu()[~samples.filled].any()
@@ -108,7 +104,7 @@ def test_windows_stay_bounded_where_their_variance_is_lost(level):
     bounds = (8 * 2 / 0.03 + 1 / 0.01) / (3 * tiles * filled.clamp(min=1))[tile_of_slot]  # `SSIM_SLOPE` of the twin's
     for colors in (targets + 0.01 * torch.sin(9.0 * x + 5.0 * y)[:, None], targets.roll(1, dims=0)):
         colors = colors * samples.filled[:, None]
-        found = training_kernels.sparse_loss(terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples))
+        found = training_kernels.sparse_loss(terms, colors.to(DEVICE), targets.to(DEVICE), samples_to(samples, DEVICE))
         assert 0 <= float(found.loss) <= 2
         assert (found.color_gradients.abs().amax(dim=1).cpu() <= bounds).all()
         assert torch.isfinite(found.color_gradients).all()
@@ -121,7 +117,11 @@ def test_maps_follow(rate):
     colors, targets, _ = make_colors(samples)
     maps, twin = make_maps(DEVICE), make_maps("cpu")
     found = training_kernels.sparse_loss(
-        CASES["ncc"].terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples), update=MapUpdate(maps, STEP)
+        CASES["ncc"].terms,
+        colors.to(DEVICE),
+        targets.to(DEVICE),
+        samples_to(samples, DEVICE),
+        update=MapUpdate(maps, STEP),
     )
     twin.update(samples, found.pixel_errors.cpu(), STEP)
     assert torch.equal(maps.errors.cpu(), twin.errors)
@@ -142,7 +142,7 @@ def test_bad_colors_stay_out(bad, name):
         CASES[name].terms,
         colors.to(DEVICE),
         targets.to(DEVICE),
-        to_device(samples),
+        samples_to(samples, DEVICE),
         update=MapUpdate(maps, STEP),
     )
     assert torch.isfinite(found.loss)
@@ -150,7 +150,7 @@ def test_bad_colors_stay_out(bad, name):
     assert torch.isfinite(gradients).all() and not gradients[slots].any()
     assert gradients[torch.arange(len(samples)) != 5].abs().sum() > 0
     before = make_maps("cpu")
-    flat = before.flat_pixels(samples)
+    flat = samples.flat_pixels(before.offsets)
     assert torch.equal(maps.errors.cpu()[flat[slots]], before.errors[flat[slots]])
     assert (maps.stamps.cpu()[flat[slots]] == -1).all()
     assert (maps.stamps.cpu()[flat] == STEP.iteration).sum() == len(samples) - 3
@@ -160,7 +160,7 @@ def test_bad_colors_stay_out(bad, name):
 def test_side_stream_and_half_colors():
     samples = make_samples(0.3)
     colors, targets, _ = make_colors(samples)
-    colors, targets, samples = colors.half().to(DEVICE), targets.to(DEVICE), to_device(samples)
+    colors, targets, samples = colors.half().to(DEVICE), targets.to(DEVICE), samples_to(samples, DEVICE)
     expected = training_kernels.sparse_loss(CASES["ncc"].terms, colors, targets, samples)
     found = on_side_stream(lambda: training_kernels.sparse_loss(CASES["ncc"].terms, colors + 0, targets + 0, samples))
     assert torch.equal(found.color_gradients, expected.color_gradients)
@@ -178,6 +178,6 @@ def test_lost_losses_are_counted_once(name):
     for value, expected in ((0.5, 0), (1e38, 1), (0.5, 1), (1e38, 2)):
         colors[::7] = value
         found = training_kernels.sparse_loss(
-            CASES[name].terms, colors.to(DEVICE), targets.to(DEVICE), to_device(samples), update
+            CASES[name].terms, colors.to(DEVICE), targets.to(DEVICE), samples_to(samples, DEVICE), update
         )
         assert int(counter) == expected and bool(torch.isfinite(found.loss)) == (value == 0.5)

@@ -5,7 +5,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
-from helpers.raster_cases import GPU_ONLY
+from helpers.raster_cases import GPU_ONLY, samples_to
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.distributed.peer_memory import aligned_starts
@@ -93,16 +93,11 @@ class Scene:
         """Those of the kernels; the records are copied, as a step may overwrite them. Off screen they hold anything."""
         gaussians = gaussians or self.on_device()
         on_screen = (self.radii > 0).any(dim=-1, keepdim=True)
-        samples = PixelSamples(
-            self.samples.view_ids,
-            self.samples.sizes,
-            *(getattr(self.samples, name).to(DEVICE) for name in ("pixel_ids", "tile_ids", "tile_offsets")),
-        )
         viewmats, Ks = self.cameras.viewmats.to(DEVICE), self.cameras.Ks.to(DEVICE)
         images = [number for row, size in enumerate(self.cameras.sizes.tolist()) for number in (*size, row)]
         return CudaScreenGradients(
             scene=launches.Scene(gaussians, viewmats, Ks, images, self.degree, DEFAULT_SETTINGS.eps2d),
-            samples=samples,
+            samples=samples_to(self.samples, DEVICE),
             records=torch.where(on_screen, self.records, torch.nan).to(DEVICE, copy=True),
             radii=self.radii.to(DEVICE),
             overflow=overflow,
@@ -242,14 +237,6 @@ def test_a_step_changes_copies_alike(degree):
             assert torch.equal(copy[stepped], value[stepped]) and bool(copy[~stepped].isnan().all()), name
     with pytest.raises(InputError, match="must lie as the model does"):
         _ = ModelCopies(own, [others[0].map(torch.clone)]).distances
-
-
-def test_balanced_step_without_shares_is_adam():
-    scene = Scene()
-    scene.records[..., ScreenRecord.ERROR_SUM] = 0
-    stepped = [one_step(optimizer, scene) for optimizer in (MomentLMOptimizer(RATES), SparseAdam(RATES, eps=1e-20))]
-    for parameter, value in stepped[0].items():
-        assert torch.equal(value, getattr(stepped[1], parameter)), parameter
 
 
 def test_rows_of_vanishing_loss_are_cut():

@@ -68,12 +68,13 @@ def assert_equal_samples(found, expected):
 @pytest.mark.parametrize("unit", ["pixel", "tile"])
 @pytest.mark.parametrize("rate", [0.004, 0.1, 0.33, 1.0])
 @pytest.mark.parametrize(
-    ("hard", "stable", "uniform"),
-    [(0.4, 0.3, False), (0.4, 0.3, True), (0.0, 0.0, True), (1.0, 0.0, False), (0, 1, False)],
+    ("hard", "stable", "uniform", "importance"),
+    [(0.4, 0.3, False, 0.5), (0.4, 0.3, True, 0.0), (0.0, 0.0, True, 0.0), (1.0, 0.0, False, 1.0), (0, 1, False, 0.0)],
 )
-def test_equal_sets(unit, rate, hard, stable, uniform):
+def test_equal_sets(unit, rate, hard, stable, uniform, importance):
+    """The weights, too, where there are any."""
     errors, stamps = random_maps()
-    rule = DrawRule(unit, hard, stable, uniform, 0.0)
+    rule = DrawRule(unit, hard, stable, uniform, importance)
     for iteration, views in enumerate([(0,), (3, 1, 0, 2)]):
         assert_equal_samples(*draw_both(errors, stamps, views, rate, rule, 2**40 + 5, iteration))
 
@@ -95,14 +96,6 @@ def test_equal_sets_of_many_tiles(iteration):
     assert_equal_samples(*draw_both(errors, stamps, (0,), 0.75, rule, 5, iteration, sizes))
 
 
-@pytest.mark.parametrize("unit", ["pixel", "tile"])
-@pytest.mark.parametrize("importance", [0.5, 1.0])
-def test_importance_weights(unit, importance):
-    errors, stamps = random_maps(seed=1)
-    rule = DrawRule(unit, 0.4, 0.3, False, importance)
-    assert_equal_samples(*draw_both(errors, stamps, (2, 3), 0.2, rule, 11, 400))
-
-
 @pytest.mark.parametrize("value", [0.0, 0.25])
 def test_tied_errors_and_ages(value):
     """All errors and ages equal: only the random words and the ranks decide."""
@@ -122,15 +115,6 @@ def test_equal_keys_at_the_threshold(iteration):
     assert keys[24] == keys[25]
     rule = DrawRule("pixel", 1.0, 0.0, False, 0.0)
     assert_equal_samples(*draw_both(errors, stamps, (1,), 0.1, rule, 0, iteration))
-
-
-@pytest.mark.parametrize("name", ["errors", "stamps"])
-def test_wrong_tensors_are_named(name):
-    maps = make_maps(DEVICE, *random_maps())
-    value = getattr(maps, name)
-    setattr(maps, name, value.float() if name == "errors" else value.repeat_interleave(2)[::2])
-    with pytest.raises(RuntimeError, match=f"{name} must be a contiguous"):
-        training_kernels.sample_pixels(DrawRule("pixel", 0.4, 0.3, False, 0.0), maps, (1,), 0.1, Step(0, 1, 1))
 
 
 def test_exponentials_have_the_same_bits():

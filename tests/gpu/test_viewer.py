@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.raster_cases import GPU_ONLY
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.device import synchronize
-from turbogs_plugin.engine.cuda import library as kernels
 from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.scene.offload import place_views
@@ -16,10 +16,7 @@ from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.pictures import CaptureViews, ModelState, Picture, draw
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(bool(kernels.unavailable_reason()), reason="needs a GPU and the kernels"),
-]
+pytestmark = GPU_ONLY
 CUDA, CPU = torch.device("cuda"), torch.device("cpu")
 
 
@@ -32,18 +29,13 @@ def subjects(request, tmp_path_factory) -> tuple[ModelState, ModelState]:
     scene = load_scene(capture)
     loop = new_loop(make_plan(config, scene, CUDA).apply(config), scene, CUDA)
     trainer = loop.trainer
-    latest = []
-    trainer.on_samples = lambda samples: latest.__setitem__(slice(None), [samples])
     loop.run()
     synchronize(CUDA)
     views = CaptureViews(trainer.views, place_views(scene.test, CUDA, request.param))
     look = Look(trainer.sh_degree, DEFAULT_SETTINGS)
-    here = ModelState(trainer.gaussians, look, views, (trainer.maps, trainer.now), latest[0])
-    return here, ModelState(trainer.gaussians.map(torch.Tensor.cpu), look, CaptureViews(*split(scene)))
-
-
-def split(scene):
-    return scene.train.to(CPU), scene.test.to(CPU)
+    on_cpu = CaptureViews(scene.train.to(CPU), scene.test.to(CPU))
+    here = ModelState(trainer.gaussians, look, views)
+    return here, ModelState(trainer.gaussians.map(torch.Tensor.cpu), look, on_cpu)
 
 
 @pytest.mark.parametrize("picture", [Picture.RENDER, Picture.COMPARE])

@@ -1,13 +1,38 @@
-"""Calls with damaged or hostile input, which may end in an `InputError` but take no memory to speak of."""
+"""Damaged input, and calls with it, which may end in an `InputError` but take no memory to speak of."""
 
 from __future__ import annotations
 
+import math
+import random
 import re
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from turbogs_plugin.errors import InputError
+
+NUMBERS = (b"\xff" * 8, struct.pack("<Q", 2**60), bytes(8), struct.pack("<d", math.nan), struct.pack("<d", math.inf))
+"""Eight bytes that are a hostile count or number."""
+
+
+def damaged(content: bytes, choice: random.Random) -> bytes:
+    """Cut, overwritten in some bytes, with a hostile number in it, or with a piece moved into it."""
+    data = bytearray(content)
+    kind, place = choice.randrange(4), choice.randrange(len(data))
+    if kind == 0:
+        del data[place:]
+    elif kind == 1:
+        for _ in range(choice.choice([1, 1, 4])):
+            data[choice.randrange(len(data))] = choice.randrange(256)
+    elif kind == 2:
+        place = choice.choice([0, 8, 12, 16, 24, place])
+        data[place : place + 8] = choice.choice(NUMBERS)
+    else:
+        source = choice.randrange(len(data))
+        data[place:place] = data[source : source + choice.randrange(64)]
+    return bytes(data)
+
 
 REFERENCES, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 """Linux tells the peak of a process since it was asked to forget the one before."""

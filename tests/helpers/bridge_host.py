@@ -16,7 +16,7 @@ WIDTH, HEIGHT = 40, 24
 RATES = {"means": 1e-3, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 1e-2, "shN": 5e-4}
 
 
-def make_splats(count: int = 40, seed: int = 0, bands: int = 3, device: str = "cpu") -> torch.nn.ParameterDict:
+def make_splats(count: int = 40, seed: int = 0, device: str = "cpu") -> torch.nn.ParameterDict:
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -28,7 +28,7 @@ def make_splats(count: int = 40, seed: int = 0, bands: int = 3, device: str = "c
         "quats": normal(count, 4),
         "opacities": normal(count),
         "sh0": normal(count, 1, 3),
-        "shN": 0.1 * normal(count, bands, 3),
+        "shN": 0.1 * normal(count, 3, 3),
     }
     return torch.nn.ParameterDict({name: torch.nn.Parameter(value.to(device)) for name, value in values.items()})
 
@@ -66,6 +66,14 @@ def looks_of_others() -> torch.Tensor:
         return sparse_rasterization(**truth, samples=dense_samples(cameras), sh_degree=1)[0]
 
 
+def optimizers_of(splats: torch.nn.ParameterDict, optimizer_class: Any) -> dict[str, Any]:
+    """As gsplat's trainer makes them."""
+    options = {"eps": 1e-15, "betas": (0.9, 0.999), "fused": True}
+    return {
+        name: optimizer_class([{"params": splats[name], "lr": RATES[name], "name": name}], **options) for name in splats
+    }
+
+
 @dataclass
 class Host:
     """A trainer that fits what other Gaussians look like, in the order of calls of gsplat's.
@@ -85,15 +93,7 @@ class Host:
         self.cameras = make_cameras(3)
         self.samples = dense_samples(self.cameras)
         self.pixels = looks_of_others()
-        self.optimizers = {
-            name: self.optimizer_class(
-                [{"params": self.splats[name], "lr": RATES[name], "name": name}],
-                eps=1e-15,
-                betas=(0.9, 0.999),
-                fused=True,
-            )
-            for name in self.splats
-        }
+        self.optimizers = optimizers_of(self.splats, self.optimizer_class)
         self.schedulers = [torch.optim.lr_scheduler.ExponentialLR(self.optimizers["means"], gamma=0.99)]
         self.strategy.check_sanity(self.splats, self.optimizers)
         self.state = self.strategy.initialize_state(scene_scale=1.0)

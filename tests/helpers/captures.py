@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from helpers.painted import axes_of
 from PIL import Image
 
 TARGET = np.array([3.0, -1.0, 2.0])
@@ -66,10 +67,8 @@ def camera_to_world(angle: float) -> np.ndarray:
     """OpenGL's: x right, y up, z backward; on a ring of radius 4 about the target, looking at it, z up."""
     center = TARGET + np.array([4 * math.cos(angle), 4 * math.sin(angle), 1.0])
     backward = (center - TARGET) / np.linalg.norm(center - TARGET)
-    right = np.cross([0.0, 0.0, 1.0], backward)
-    right /= np.linalg.norm(right)
     pose = np.eye(4)
-    pose[:3] = np.stack([right, np.cross(backward, right), backward, center], axis=1)
+    pose[:3] = np.c_[axes_of(backward).T, center]
     return pose
 
 

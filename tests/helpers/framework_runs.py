@@ -2,7 +2,7 @@
 
 import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -38,9 +38,13 @@ ENDLESS = ("train.iterations=100000", "train.refine_until=9", "train.checkpoint_
 
 
 def tiny_settings(*overrides: str) -> list[str]:
-    """`TINY` without the settings of sections whose type an override changes: these start afresh."""
+    return without_replaced(TINY, overrides)
+
+
+def without_replaced(settings: Sequence[str], overrides: Sequence[str]) -> list[str]:
+    """Settings without those of sections whose type an override changes: these start afresh."""
     replaced = tuple(text.partition("type=")[0] for text in overrides if ".type=" in text)
-    return [text for text in TINY if not text.startswith(replaced)]
+    return [text for text in settings if not text.startswith(replaced)]
 
 
 def tiny_capture(folder: Path) -> Path:

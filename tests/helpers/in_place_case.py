@@ -26,8 +26,8 @@ from turbogs_plugin.engine.render_pass import ScreenRecords
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 
-CASES = {"several views": (3, 5), "one view": (1, 1)}
-"""Name -> the fewest and the most views of an iteration."""
+CASES = ((3, 5), (1, 1))
+"""The fewest and the most views of an iteration."""
 STEPS = 60
 
 
@@ -122,7 +122,7 @@ def recoveries(trainer: Trainer) -> list[int]:
 def compared(capture: Path, ranks: Ranks) -> None:
     """Every case, with density control, a view rendered densely by one process alone, and an overflow in one."""
     workspace.CAPACITY_STEP = 32  # so that these few intersections can be too many
-    for name, views in CASES.items():
+    for views in CASES:
         kept = Kept()
         trainer = trainer_of(capture, ranks, views)
         recovered, engine = recoveries(trainer), trainer.engine
@@ -144,9 +144,6 @@ def compared(capture: Path, ranks: Ranks) -> None:
         assert len(trainer.gaussians) != count and trainer.iteration == STEPS
         assert recovered, "no overflow"
         kept.compare(ranks)
-        if ranks.first:
-            updates = f"{len(kept.parameters)} updates by owners, {kept.arrived_in_place} in place"
-            print(f"{name}: {len(kept.screens)} passes, {updates}; recovered at {recovered}", flush=True)
 
 
 def dying(capture: Path, ranks: Ranks, told: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 
 import torch
+from helpers.models import random_gaussians
 from torch import Tensor
 
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
@@ -13,21 +14,10 @@ from turbogs_plugin.types import GaussianGradients, Gaussians, GaussianStats, St
 STEP = Step(iteration=100, total=5000, refine_until=3500, seed=7, scene_extent=2.0)
 
 
-def make_gaussians(count: int, seed: int = 0, dtype=torch.float64, bands: int = 3) -> Gaussians:
+def make_gaussians(count: int, seed: int = 0, dtype=torch.float64) -> Gaussians:
     """Random Gaussians; band 0's first entry is the row number, so that rows can be recognised later."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=dtype)
-
-    gaussians = Gaussians(
-        means=normal(count, 3),
-        quats=normal(count, 4),
-        scales=0.5 * normal(count, 3) - 4,
-        opacities=normal(count),
-        sh0=normal(count, 1, 3),
-        shN=normal(count, bands, 3),
-    )
+    gaussians = random_gaussians(count, 1, seed, dtype)
+    gaussians.scales = 0.5 * gaussians.scales - 4
     gaussians.sh0[:, 0, 0] = torch.arange(count, dtype=dtype)
     return gaussians
 
@@ -36,9 +26,7 @@ def clone(gaussians: Gaussians) -> Gaussians:
     return gaussians.map(lambda value: value.clone())
 
 
-def make_gradients(
-    views: int, count: int, seed: int = 1, dtype=torch.float64, bands: int = 3, size: float = 1e-5
-) -> GaussianGradients:
+def make_gradients(views: int, count: int, seed: int = 1, dtype=torch.float64, size: float = 1e-5) -> GaussianGradients:
     """Random gradients of about `size` in every view, all Gaussians touched, loss shares of about `size`."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -51,7 +39,7 @@ def make_gradients(
         scales=10 * normal(views, count, 3),
         opacities=normal(views, count),
         sh0=normal(views, count, 1, 3),
-        shN=normal(count, bands, 3),
+        shN=normal(count, 3, 3),
         touched=torch.ones(count, dtype=torch.bool),
         view_losses=normal(views, count).abs() * 0.1,
     )
@@ -114,19 +102,3 @@ def all_finite(gaussians: Gaussians) -> bool:
 def equal(one: Gaussians, other: Gaussians) -> bool:
     """To the last bit."""
     return all(torch.equal(value, getattr(other, name)) for name, value in one.items())
-
-
-def assert_resumed_is_bit_identical(cls: type) -> None:
-    """Six steps of an optimizer at once, and with its state taken over by another one after three."""
-    whole, parts = make_gaussians(6, dtype=torch.float32), make_gaussians(6, dtype=torch.float32)
-    first, second, resumed = cls(), cls(), cls()
-    first.setup(whole)
-    second.setup(parts)
-    for seed in range(6):
-        gradients = make_gradients(3, 6, seed, torch.float32)
-        first.step(whole, gradients, STEP)
-        if seed == 3:
-            resumed.setup(parts)
-            resumed.load_state_dict(second.state_dict())
-        (second if seed < 3 else resumed).step(parts, gradients, STEP)
-    assert equal(whole, parts)

@@ -10,6 +10,21 @@ COLORS = ((255, 40, 40), (40, 255, 40), (40, 40, 255))
 """Colours of the painted points; nothing else in a photo may have them."""
 
 
+def axes_of(backward: np.ndarray, up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> np.ndarray:
+    """[3, 3] rows right, up and backward of a camera of OpenGL's. backward: [3], of length 1."""
+    right = np.cross(up, backward)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(backward, right), backward])
+
+
+def seen_by(
+    axes: np.ndarray, center: np.ndarray, points: np.ndarray, focal: float, size: tuple[int, int]
+) -> np.ndarray:
+    """[N, 2] where such a camera sees points [N, 3]: y of the image points down, y of the camera up."""
+    across, along, behind = axes @ (points - center).T
+    return np.stack([0.5 * size[0] - focal * across / behind, 0.5 * size[1] + focal * along / behind], axis=1)
+
+
 def painted_photo(size: tuple[int, int], pixels: np.ndarray) -> np.ndarray:
     """[H, W, 3] uint8, black but for a pixel a point.
 

@@ -44,8 +44,8 @@ class Case:
 
 
 def samples_to(samples: PixelSamples, device: torch.device | str) -> PixelSamples:
-    names = ("pixel_ids", "tile_ids", "tile_offsets")
-    return replace(samples, **{name: getattr(samples, name).to(device) for name in names})
+    values = {name: getattr(samples, name) for name in ("pixel_ids", "tile_ids", "tile_offsets", "weights")}
+    return replace(samples, **{name: None if value is None else value.to(device) for name, value in values.items()})
 
 
 def make_case(

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from helpers.models import random_gaussians
 from torch import Tensor
 
 from turbogs_plugin.engine.render import dense_samples
@@ -38,19 +39,9 @@ def make_cameras(sizes: list[tuple[int, int]], dtype=torch.float64, distance: fl
 
 def make_gaussians(count: int, seed: int = 0, dtype=torch.float64, degree: int = 3, spread: float = 1.0) -> Gaussians:
     """Gaussians about the origin, of mixed sizes, shapes and opacities."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    gaussians = Gaussians(
-        means=spread * normal(count, 3),
-        quats=normal(count, 4),
-        scales=-1.8 + 0.7 * normal(count, 3),
-        opacities=0.5 + 1.5 * normal(count),
-        sh0=normal(count, 1, 3),
-        shN=0.2 * normal(count, (degree + 1) ** 2 - 1, 3),
-    )
+    gaussians = random_gaussians(count, degree, seed, torch.float64)
+    gaussians.means, gaussians.scales = spread * gaussians.means, -1.8 + 0.7 * gaussians.scales
+    gaussians.opacities, gaussians.shN = 0.5 + 1.5 * gaussians.opacities, 0.2 * gaussians.shN
     return gaussians.map(lambda value: value.to(dtype))
 
 

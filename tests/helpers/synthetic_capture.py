@@ -20,7 +20,6 @@ RING_RADIUS = 3.0
 
 POINT_NOISE = 0.01
 """Standard deviation of the points' noise."""
-PIXELS_PER_GAUSSIAN, FEWEST_GAUSSIANS = 40, 100
 EXTENT_MARGIN, TEST_EVERY = 1.1, 8
 """Value of 3DGS."""
 
@@ -63,17 +62,16 @@ def surface_gaussians(count: int, device: torch.device, seed: int = 0) -> Gaussi
 
 
 @torch.no_grad()
-def synthetic_scene(views: int, width: int, height: int, device: torch.device, gaussians: int | None = None) -> Scene:
+def synthetic_scene(views: int, width: int, height: int, device: torch.device, gaussians: int) -> Scene:
     """A scene whose photos are renders of `surface_gaussians`, in host memory.
 
     Args:
         views: photos in all, from a ring of cameras; every eighth one tests.
         width, height: of each.
         device: where to render them.
-        gaussians: of the model that is photographed; one for `PIXELS_PER_GAUSSIAN` of a photo where None. A quarter of
-            them are the points of the reconstruction.
+        gaussians: of the model that is photographed. A quarter of them are the points of the reconstruction.
     """
-    model = surface_gaussians(gaussians or max(FEWEST_GAUSSIANS, width * height // PIXELS_PER_GAUSSIAN), device)
+    model = surface_gaussians(gaussians, device)
     cameras = ring_cameras(views, width, height, device)
     test = np.arange(views) % TEST_EVERY == 0
 

@@ -6,6 +6,7 @@ import struct
 import numpy as np
 import pytest
 import torch
+from helpers.models import random_gaussians
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
@@ -14,17 +15,11 @@ from turbogs_plugin.scene import Frame
 from turbogs_plugin.types import SH_C0, Gaussians
 
 
-def gaussians(count: int = 300, degree: int = 3) -> Gaussians:
-    generator = torch.Generator().manual_seed(3)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=generator)
-
-    bands = (degree + 1) ** 2 - 1
-    shN = 0.2 * normal(count, bands, 3).clamp(-3, 3)
-    return Gaussians(
-        normal(count, 3), normal(count, 4), normal(count, 3) - 4.0, normal(count), 0.8 * normal(count, 1, 3), shN
-    )
+def gaussians() -> Gaussians:
+    """Colours and harmonics are small, as formats of few bits have them."""
+    made = random_gaussians(300, seed=3)
+    made.scales, made.sh0, made.shN = made.scales - 4.0, 0.8 * made.sh0, 0.2 * made.shN.clamp(-3, 3)
+    return made
 
 
 def matched(made: Gaussians, read: Gaussians) -> Gaussians:

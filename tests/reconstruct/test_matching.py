@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from turbogs_plugin.reconstruct import matching
-from turbogs_plugin.reconstruct.matching import are_ordered, choose_pairs, metres_of, natural_order
+from turbogs_plugin.reconstruct.matching import choose_pairs, metres_of, natural_order
 
 FILM = [f"frame_{number:05d}.jpg" for number in range(0, 1000, 2)]
 HASHES = [f"{number * 2654435761 % 2**32:08x}.jpg" for number in range(500)]
@@ -67,16 +67,3 @@ def test_gps_of_a_room_or_of_a_few_photos_says_nothing():
     for positions in (flight(500, 10.0), some):
         pairs, reason = choose_pairs(HASHES, positions)
         assert len(pairs) == 500 * 499 // 2 and "neither names nor GPS" in reason
-
-
-@pytest.mark.parametrize(
-    ("names", "ordered"),
-    [
-        (["a/1.jpg", "a/2.jpg", "a/4.jpg"], True),
-        (["IMG_0001.JPG", "IMG_0500.JPG"], False),
-        (["left.jpg", "right.jpg"], False),
-        (["one.jpg"], False),
-    ],
-)
-def test_what_counts_as_ordered(names, ordered):
-    assert are_ordered(names) is ordered

@@ -11,11 +11,10 @@ from helpers.framework_runs import assert_identical, stop_after, tiny_config
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan import facts
-from turbogs_plugin.scene import Scene, host_arrays
+from turbogs_plugin.scene import host_arrays
 from turbogs_plugin.scene.host_arrays import host_array, in_file
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
-from turbogs_plugin.train.trainer import Trainer
 
 HOST_MEMORY = 1000
 """Bytes: less than one photo of the capture takes."""
@@ -77,33 +76,12 @@ def test_free_memory_is_that_of_the_container(monkeypatch, tmp_path, files, left
     assert host_arrays.free_host_bytes() == left
 
 
-def trained(scene: Scene, capture: Path, *overrides: str) -> Trainer:
-    trainer = Trainer(tiny_config(capture, *overrides).without_plan(), scene, CPU)
-    trainer.initialise_maps()
-    for _ in range(9):
-        trainer.step()
-    return trainer
-
-
-@pytest.mark.parametrize("unit", ["pixel", "tile"])
-def test_training_from_files_is_bit_for_bit_that_from_memory(capture, little_memory, monkeypatch, unit):
-    overrides = (f"pixel_sampler.unit={unit}",)
-    streamed = load_scene(capture)
-    from_files = trained(streamed, capture, "train.pixels_place=host", *overrides)
-    assert in_file(streamed.train.photos.stored) and in_file(streamed.test.photos.stored)
-    assert all(in_file(from_files.maps.state_dict()[name]) for name in ("errors", "stamps"))
-    assert streamed.notes[-1].startswith("photos lie in a temporary file, 0.0 GiB in ")
-    monkeypatch.undo()
-    scene = load_scene(capture)
-    assert not in_file(scene.train.photos.stored) and "temporary file" not in scene.notes[-1]
-    assert_identical(trained(scene, capture, *overrides).state_dict(), from_files.state_dict())
-
-
 def test_a_whole_run_streams_and_resumes_to_the_same_model(capture, little_memory, monkeypatch, tmp_path):
     """What the plan decides; stopped and resumed with little memory, and with much."""
     stop_after(monkeypatch, 7)
     streamed = run.train(tiny_config(capture), tmp_path / "streamed")
     assert streamed.signal and streamed.trainer.config.train.pixels_place == "host"
+    assert in_file(streamed.trainer.views.photos.stored)
     assert "> 50% of 0 MiB free on the host: maps in a file" in (tmp_path / "streamed/plan.txt").read_text()
     shutil.copytree(tmp_path / "streamed", tmp_path / "moved")
     resumed = [run.resume(tmp_path / "streamed")]
@@ -111,6 +89,7 @@ def test_a_whole_run_streams_and_resumes_to_the_same_model(capture, little_memor
     monkeypatch.undo()
     resumed.append(run.resume(tmp_path / "moved"))
     assert not in_file(resumed[1].trainer.maps.state_dict()["errors"])
+    assert not in_file(resumed[1].trainer.views.photos.stored)
     whole = run.train(tiny_config(capture), tmp_path / "whole")
     states = [
         load_checkpoint(latest_checkpoint(session.folder.checkpoints))["trainer"] for session in (whole, *resumed)

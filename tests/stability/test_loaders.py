@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.bounded_memory import outcome_within
+from helpers.bounded_memory import damaged, outcome_within
 from helpers.framework_runs import tiny_config
 from PIL import Image
 
@@ -33,24 +33,6 @@ MEMORY = 64 * 2**20
 def finished(capture, tmp_path_factory) -> Path:
     """The folder of a finished run, which is not to be changed."""
     return run.train(tiny_config(capture, "train.iterations=3"), tmp_path_factory.mktemp("runs") / "run").folder.path
-
-
-def damaged(content: bytes, choice: random.Random) -> bytes:
-    """Cut, overwritten in some bytes, or with a piece moved into it."""
-    data, place = bytearray(content), choice.randrange(len(content))
-    kind = choice.randrange(3)
-    if kind == 0:
-        del data[place:]
-    elif kind == 1:
-        for _ in range(choice.choice([1, 2, 8])):
-            data[choice.randrange(len(data))] = choice.randrange(256)
-    else:
-        source = choice.randrange(len(data))
-        data[place:place] = data[source : source + choice.randrange(64)]
-    return bytes(data)
-
-
-# ---- Checkpoints -------------------------------------------------------------------------------------------------
 
 
 def leaves(value, path=()):
@@ -111,9 +93,6 @@ def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
     assert cases > 50 and refused > 0.6 * cases
 
 
-# ---- Text --------------------------------------------------------------------------------------------------------
-
-
 BOMBS = {
     "aliases": "a: &a [x]\n" + "".join(f"b{i}: &b{i} [*a, *a]\n" for i in range(50)),
     "tag": "a: !!python/object/apply:os.system ['true']",
@@ -128,9 +107,6 @@ BOMBS = {
 def test_yaml_bombs(tmp_path, name):
     (tmp_path / "bomb.yaml").write_text(BOMBS[name])
     assert isinstance(outcome_within(MEMORY, load_config, str(tmp_path / "bomb.yaml")), InputError)
-
-
-# ---- Captures ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["one byte", "cut", "other size", "text", "empty", "damaged"])

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from helpers.bounded_memory import outcome_within
 from helpers.framework_runs import tiny_config
 from helpers.models import random_gaussians
@@ -111,9 +110,6 @@ def test_other_values_in_files_of_frames(photos, kind):
     assert 20 < refused < 60
 
 
-# ---- Models to start from ----------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def scene(capture) -> Scene:
     return load_scene(capture, factor=4)
@@ -155,25 +151,3 @@ def test_damaged_starts(scene, capture, tmp_path, suffix):
         if not isinstance(result, InputError):
             require_whole_model(result)
     assert 8 < refused < 40
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".pt"])
-@pytest.mark.parametrize("broken", [1, 20])
-def test_not_finite_in_a_start(scene, capture, tmp_path, suffix, broken):
-    """Left out and counted; refused where none remains."""
-    file, model = tmp_path / f"model{suffix}", random_gaussians(20, sh_degree=1)
-    model.sh0[:broken, 0, 1] = 123.5  # to be found in the file
-    if suffix == ".ply":
-        save_ply(model, file)
-        file.write_bytes(file.read_bytes().replace(struct.pack("<f", 123.5), struct.pack("<f", np.nan)))
-    else:
-        save_gsplat(model, file, Frame(np.zeros(3), 1.0))
-        state = torch.load(file, weights_only=True)
-        state["splats"]["sh0"][:broken, 0, 1] = torch.inf
-        torch.save(state, file)
-    result = started(scene, capture, file)
-    if broken == 20:
-        assert isinstance(result, InputError) and file.name in str(result)
-    else:
-        assert len(result) == 19
-        require_whole_model(result)

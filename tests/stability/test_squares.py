@@ -17,9 +17,6 @@ from turbogs_plugin.types import GaussianStats, Step
 COUNT = 40
 
 
-# ---- Few Gaussians, and caps ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("count", [1, 2, 3, 19])
 @pytest.mark.parametrize("cap", ["none", "one", "present"])
 def test_a_model_of_less_than_20_loses_none_to_turnover(count, cap):
@@ -66,9 +63,6 @@ def test_the_cut_to_a_cap_holds_where_squares_overflow(square, cap):
     stats = window([square, math.nan, math.inf, square / 3, square, square * 1.1])
     kept = event(gaussians, stats, max_gaussians=3, prune_score_fraction=0.0).source.tolist()
     assert kept == [2, 4, 5]  # the least, and the first of two average ones
-
-
-# ---- What a window may hold ----------------------------------------------------------------------------------------
 
 
 def test_nothing_seen_in_a_window_changes_nothing():
@@ -151,9 +145,6 @@ def test_more_zeros_than_the_share_stop_turnover(zeros, goes):
     assert not goes or set(rows) <= gone
 
 
-# ---- Units ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("factor", [1e-12, 1e-6, 1e6, 1e12, 2.0**-20, 2.0**20])
 def test_the_unit_of_the_loss_does_not_choose(factor):
     """Squares of a loss times `factor`, as long as they are above `TINY`."""
@@ -178,9 +169,6 @@ def test_the_unit_of_the_world_does_not_choose(scale):
     update = event(gaussians, stats, replace(EVENT, scene_extent=scale * EVENT.scene_extent), **settings)
     assert torch.equal(update.source, expected.source) and update.num_split == expected.num_split
     assert len(removed(update, COUNT)) > 4 and len(grown(update)) > 5
-
-
-# ---- Many events ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("decay", [0.4, 0.01, 1e-5])

@@ -7,12 +7,7 @@ import math
 import pytest
 import torch
 from gsplat.strategy.ops import duplicate, remove, reset_opa
-from helpers.optimizers import (
-    STEP,
-    equal,
-    make_gaussians,
-    make_gradients,
-)
+from helpers.optimizers import STEP, equal, make_gaussians, make_gradients
 
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam

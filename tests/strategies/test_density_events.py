@@ -7,11 +7,13 @@ import torch
 from gsplat.strategy import MCMCStrategy, ops
 from helpers.optimizers import fill, make_gaussians, random_stats
 
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.fastgs import FastGsDensity
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
 from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 from turbogs_plugin.strategies.density.rows import NoDensity
+from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.types import Gaussians, Step
 
 TOTAL, REFINE_UNTIL, COUNT = 60, 30, 40
@@ -114,3 +116,26 @@ def test_an_event_ends_a_window_whether_it_changes_anything_or_not():
     change = density.update(gaussians, due)
     density.apply(change.taking(torch.arange(3, 20)))
     assert all(len(value) == 17 and not value.any() for value in vars(density.stats).values())
+
+
+def test_what_mcmc_adds_has_the_step_count_of_what_it_was_copied_from():
+    """Some are dead and relocated first, onto others of which copies may be added as well."""
+    gaussians, added = model(), COUNT // 20  # 5 %
+    before = gaussians.sh0.clone()
+    optimizer = MomentLMOptimizer()
+    optimizer.setup(gaussians)
+    optimizer.moments.steps[:] = torch.arange(COUNT) + 1
+    optimizer.moments.exp_avg[:] = 1.0
+    update = GsplatMcmcDensity(max_gaussians=COUNT + added).update(gaussians, Step(600, 5000, 3500))
+    after = update.apply(gaussians)
+    optimizer.apply(update)
+    assert len(after) == COUNT + added
+    assert update.source[:COUNT].tolist() == list(range(COUNT)) and update.num_cloned == added
+    torch.testing.assert_close(after.sh0[COUNT:], before[update.source[COUNT:]])
+    assert optimizer.moments.steps.tolist() == (update.source + 1).tolist()
+    assert (optimizer.moments.exp_avg[COUNT:] == 0).all()
+
+
+def test_mcmc_refuses_a_cpu():
+    with pytest.raises(InputError, match="'mcmc' needs a GPU"):
+        GsplatMcmcDensity().setup(model())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import pytest
 import torch
 from helpers.optimizers import controlled, make_gaussians, random_stats
 from helpers.squares import grown, window
@@ -14,7 +13,6 @@ from turbogs_plugin.types import Step
 
 COUNT = 40
 FULL = Step(1200, 3500, 3500, seed=3, scene_extent=2.0)  # no final pruning follows
-FINAL = Step(4000, 5000, 3500)
 GROWS = {
     "grad_threshold": 0.0,
     "absgrad_threshold": 0.0,
@@ -48,12 +46,10 @@ def test_a_draw_is_a_function_of_seed_and_iteration():
     assert torch.equal(one, same) and not torch.equal(one, later) and not torch.equal(one, other)
 
 
-@pytest.mark.parametrize("how", ["difficulty", "squares"])
-def test_a_cap_takes_the_first_by_the_given_order(how):
+def test_a_cap_takes_the_first_of_a_draw():
     gaussians, stats = make_gaussians(COUNT), random_stats(COUNT, seed=1, seen=1.0)
-    density = controlled(gaussians, stats, choose_by=how, max_gaussians=COUNT + 5, **GROWS)
-    keys = density.scores(FULL)[0] if how == "difficulty" else drawn_by_squares(stats, FULL)
-    keys[stats.weight_sums == 0] = -torch.inf
+    density = controlled(gaussians, stats, choose_by="squares", max_gaussians=COUNT + 5, **GROWS)
+    keys = drawn_by_squares(stats, FULL)
     assert grown(density.update(gaussians, FULL)) == set(keys.argsort(descending=True)[:5].tolist())
 
 

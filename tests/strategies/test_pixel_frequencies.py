@@ -13,8 +13,6 @@ from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler, RandomPixelSampler
 
-# --- probabilities --------------------------------------------------------------------------------------------------
-
 
 def oldest(ages, count, left):
     """{frozenset: probability} of the `count` oldest of `left`, ties at random."""
@@ -117,9 +115,6 @@ def test_a_tile_with_one_bad_pixel_counts_its_sum_and_its_oldest():
 def test_random_pixels_are_uniform():
     drawn = drawn_units(RandomPixelSampler(), 2.5 / 256, 3000, (3, 2), ERRORS, AGES, torch.arange(6))
     assert_frequencies(drawn, exact_sets([1] * 6, [1] * 6, (0, 0, 2), True))
-
-
-# --- importance weights ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,6 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 from turbogs_plugin.types import TILE_SIZE, Cameras, sample_order
 
-# --- layout ---------------------------------------------------------------------------------------------------------
-
 
 @pytest.mark.parametrize("rate", [1e-6, 0.1, 1 / 3, 1.0, 7.0])
 @pytest.mark.parametrize("unit", UNITS)
@@ -82,11 +80,6 @@ def test_counts_of_pixels(sampler, multiple, rate, wanted):
     assert [len(pixels) for pixels in pixels_by_tile(samples).values()] == [min(wanted, n) for n in extents]
 
 
-def test_multiples_are_of_single_pixels():
-    plain, whole = (ErrorGuidedPixelSampler(unit="tile", multiple=multiple).rule for multiple in (1, 32))
-    assert plain.wanted(0.3, 16) == whole.wanted(0.3, 16)
-
-
 @pytest.mark.parametrize(("rate", "tiles"), [(1e-6, (1, 1)), (0.34, (4, 2)), (1.0, (12, 6))])
 def test_counts_of_tiles(rate, tiles):
     samples = ErrorGuidedPixelSampler(unit="tile").sample(random_maps(), (4, 0), rate, step(0))
@@ -147,9 +140,6 @@ def test_draws_depend_on_seed_and_iteration_alone(unit):
     keys = [(tuple(draw.pixel_ids.tolist()), tuple(draw.tile_ids.tolist())) for draw in draws]
     assert keys[0] == keys[1]
     assert len(set(keys)) == 4
-
-
-# --- extremes -------------------------------------------------------------------------------------------------------
 
 
 def many_tiles(errors, iteration=0, sampler=None, rate=0.1):

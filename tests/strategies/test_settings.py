@@ -19,10 +19,7 @@ REFUSED = {
     "SparseAdam": ({"beta1": 1.0}, {"beta2": -0.1}, {"eps": 0.0}),
     "MomentLMOptimizer": ({"units": "metres"}, {"rows": "x"}, {"curvature": -1.0}),
     "DenseAdam": ({"opacity_reg": -1.0}, {"scale_reg": math.nan}),
-    "ErrorDrivenDensity": (
-        *({"score": "best"}, {"split": "thrice"}, {"refine_every": 0}, {"top_fraction": 0.0}, {"final_keep": 1.5}),
-        *({"choose_by": "weight"}, {"opacity_decay": 1.0}, {"max_gaussians": -1}, {"lambda_base": math.nan}),
-    ),
+    "ErrorDrivenDensity": ({"score": "best"}, {"refine_every": 0}, {"top_fraction": 0.0}, {"max_gaussians": -1}),
     "GsplatDefaultDensity": ({"opacity_reset": "never"}, {"refine_every": 0}, {"refine_start_iter": -1}),
     "GsplatMcmcDensity": ({"refine_start_iter": -1}, {"max_gaussians": 0}, {"refine_every": 0}),
 }

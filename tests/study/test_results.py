@@ -101,9 +101,6 @@ def test_settings_are_restored_from_their_changes(common, own):
     assert with_changes(common, changed) == own and changes(own, own) == {}
 
 
-# Cells' own files
-
-
 def test_a_cell_that_is_not_in_the_results_yet_is_not_lost(folder):
     new = result("other", 1, "h")
     folder.write(new)

@@ -31,9 +31,6 @@ def cell(variant: str, seed: int, *entries: Evaluation, scene: str = "fox") -> C
     return CellResult(scene=scene, variant=variant, seed=seed, settings={}, curve=curve, final=final)
 
 
-# The grid
-
-
 @functools.cache
 def configs(name: str) -> dict[str, Config]:
     """Variant -> configuration with seed 3, of a packaged ablation. Not to be changed."""
@@ -147,9 +144,6 @@ def test_a_number_of_steps_and_a_time_budget_exclude_each_other(own, of_all):
         variant_config(ablation, "timed", 0, of_all, 4)
 
 
-# Statistics
-
-
 def test_spreads_and_unpaired_differences():
     first = Spread.of([30.0, 30.2])
     assert (first.mean, first.standard_error, first.count) == (pytest.approx(30.1), pytest.approx(0.1), 2)
@@ -248,9 +242,6 @@ def test_a_capture_without_the_baseline_is_compared_with_nothing():
     fox, h = summarise(study)
     assert (fox.baseline, h.baseline) == ("base", "")
     assert "nan" not in report_text(study, [fox, h])
-
-
-# Plots
 
 
 def test_the_plot_of_a_study_has_all_its_captures():

@@ -47,10 +47,6 @@ def test_only_the_newest_two_stay(tmp_path, iterations):
         assert_newest(tmp_path, iteration)
 
 
-def test_no_checkpoint_is_none(tmp_path):
-    assert latest_checkpoint(tmp_path) is None and latest_checkpoint(tmp_path / "absent") is None
-
-
 class DiskFull:
     """Stands for a file on a disk with room for so many bytes."""
 
@@ -119,14 +115,6 @@ def test_a_kill_between_any_two_steps_keeps_a_whole_checkpoint(tmp_path, monkeyp
     assert_newest(tmp_path, int(newest.stem[-1]))
     save_checkpoint(tmp_path, 4, state(4.0))
     assert_newest(tmp_path, 4.0)
-
-
-def test_a_torn_temporary_file_is_no_checkpoint(tmp_path):
-    path = save_checkpoint(tmp_path, 1, state(1.0))
-    files.partial_path(tmp_path / "iteration-000002.pt").write_bytes(path.read_bytes()[:100])
-    assert latest_checkpoint(tmp_path) == path
-    save_checkpoint(tmp_path, 3, state(3.0))
-    assert {file.name for file in tmp_path.iterdir()} == {path.name, "iteration-000003.pt"}
 
 
 class Exploit:

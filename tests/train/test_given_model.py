@@ -1,6 +1,5 @@
 """Models trained anywhere: a start for training, and evaluated, rendered and exported with a capture named."""
 
-import dataclasses
 import re
 import shutil
 from pathlib import Path
@@ -129,13 +128,6 @@ def test_the_world_is_said_by_a_setting_in_training_and_evaluation(turbogs, fini
     assert_alike(load_given(checkpoint, load_scene(capture), "gsplat"), trained)
 
 
-def test_a_capture_that_determines_no_world_is_refused(finished, capture, tmp_path):
-    scene = load_scene(capture)
-    scene = dataclasses.replace(scene, points=scene.points[:3])
-    with pytest.raises(InputError, match=r"do not determine gsplat's .* --no-normalize-world-space"):
-        load_given(finished / "model.ply", scene, "gsplat")
-
-
 def test_rows_that_are_not_finite_are_left_out_and_counted_once(finished, capture, tmp_path):
     model = read_ply(finished / "model.ply")
     kept = torch.ones(len(model), dtype=torch.bool)
@@ -157,9 +149,6 @@ def test_ranks_of_one_model_are_put_together(finished, capture, tmp_path):
     save_splats(tmp_path / "ckpt_6999_rank1.pt", model.map(lambda value: value[half:]))
     save_splats(tmp_path / "ckpt_29999_rank1.pt", model)
     assert_alike(load_given(first, load_scene(capture)), load_model(finished, CPU).gaussians)
-
-
-# ---- Starts ------------------------------------------------------------------------------------------------------
 
 
 def test_training_starts_from_a_model_where_that_had_ended(finished, capture, tmp_path):
@@ -193,9 +182,6 @@ def test_a_model_that_is_larger_than_the_cap_is_refused(finished, capture):
         Trainer(config, load_scene(capture), CPU)
 
 
-# ---- Bad input ---------------------------------------------------------------------------------------------------
-
-
 def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
     """What -> (a file, words of the answer)."""
 
@@ -214,11 +200,9 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         "absent": (folder / "absent.ply", "no such model"),
         "another kind": (written("model.obj", b"x"), "a .ply, .spz or gsplat's .pt"),
         "empty folder": (empty, "without a checkpoint of a run"),
-        "no archive": (written("text.pt", b"text"), "cannot be used: File is not a zip file"),
         "other keys": (saved("weights.pt", {"conv1": torch.zeros(3), "bias": torch.zeros(1)}), "bias, conv1"),
         "code": (saved("code.pt", {"splats": Path("x")}), "more than plain tensors"),
         "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
-        "not a ply": (written("text.ply", b"text"), "not a whole .ply file"),
         "not a spz": (written("text.spz", b"text"), "cannot read"),
     }
 

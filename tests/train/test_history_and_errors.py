@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from turbogs_plugin.device import peak_memory_bytes
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
 from turbogs_plugin.train.metrics import Metrics, ViewMetrics, compare, psnr, ssim
 from turbogs_plugin.train.session import TrainingProgress
@@ -76,10 +75,6 @@ def test_an_exact_image_and_a_small_one():
     assert compare("view", photo, photo).psnr == 100.0
     assert math.isnan(compare("view", photo[:8], photo[:8]).ssim)
     assert math.isnan(psnr(torch.full_like(photo, math.nan), photo)), "what cannot be compared does not fit"
-
-
-def test_memory_is_that_of_this_process():
-    assert 50 * 2**20 < peak_memory_bytes(torch.device("cpu")) < 2**40
 
 
 def training(iteration: int, gaussians: int) -> SimpleNamespace:

@@ -145,9 +145,6 @@ def test_a_mask_changes_no_gradient_of_what_it_leaves(scene):
         assert float((found - expected).norm() / expected.norm()) < 1e-3, name
 
 
-# ---- Evaluation ----------------------------------------------------------------------------------------------------
-
-
 def test_errors_are_those_of_unmasked_pixels(scene):
     trainer = Trainer(tiny_config("capture").without_plan(), scene, CPU)
     metrics = evaluate(trainer.gaussians, scene.test, Look(0, trainer.config.raster))
@@ -172,9 +169,6 @@ def test_a_run_is_not_resumed_with_other_masks(capture, tmp_path):
     Image.new("L", SIZE, 255).save(mask)
     with pytest.raises(InputError, match="other masks of train images"):
         resume(tmp_path / "run")
-
-
-# ---- Backgrounds ---------------------------------------------------------------------------------------------------
 
 
 def transparent(scene):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import shlex
 import sys
 from contextlib import ExitStack
@@ -70,6 +71,7 @@ def train(
     from turbogs_plugin.report.tensorboard import event_writers
     from turbogs_plugin.train import run
 
+    gc.freeze()  # collections during training pass over the imports' objects
     settings = options.settings(scene, overrides) if resume is None else run.RunFolder(resume).read_config()
     if resume and viewer is None and run.RunFolder(resume).finished(report):
         print(f"{resume} is finished: its model is {run.RunFolder(resume).model}")

@@ -46,7 +46,7 @@ process."""
 LARGEST_BATCH = 2
 """Most times the batch of one process. Twice costs no error; four times costs caliterra .25 to .73 dB."""
 SHORTEST_SHARE = 0.4
-"""Least share of `train.base_iterations`: with fewer iterations, events of density control would be too close together.
+"""Least share of `WRITTEN_FOR`: with fewer iterations, events of density control would be too close together.
 Several processes, whose steps are longer by the root of their number, need fewer by that root."""
 
 Value = bool | int | float | str

@@ -15,12 +15,13 @@ undistorted to 120 degrees at most."""
 MOST_POINTS, MOST_PHOTOS, MOST_PIXELS = 20_000, 16, 4096
 """Points, photos, and pixels of a photo that are examined, evenly spread."""
 FEWEST_PLACES = 50
-"""Places of points within the examined photos, below which the cameras look elsewhere."""
+"""Places of points within the examined photos, or the number of points if that is less, below which the cameras look
+elsewhere."""
 CELLS = 40
 """Cells over a photo's width. The nearest point of a cell is taken for visible, the points behind it for hidden."""
 LEAST_LIKENESS, LIKENESS, FEWEST_COLORS = 0.2, 0.4, 500
 """Likeness below which photos do not show the points, the likeness that explains it, and the places that tell. Five
-captures have 0.61 to 0.84; with inverse poses 0.10 at most, with poses of other photos or a shifted cloud 0.27."""
+captures have 0.57 to 0.82; with inverse poses 0.08 at most, with poses of other photos or a shifted cloud 0.27."""
 OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes x right, y down, z forward to axes x right, y up, z backward, and back."""
 
@@ -52,7 +53,7 @@ def _contradiction(scene: Scene) -> str:
     poses = scene.frame.restore_poses(views.cameras.viewmats.cpu().numpy())  # [V, 4, 4]
     places, correlation = likeness(scene, poses)
     unlike = places >= FEWEST_COLORS and correlation < LEAST_LIKENESS
-    if places >= FEWEST_PLACES and not unlike:
+    if places >= min(FEWEST_PLACES, len(scene.points)) and not unlike:
         return ""
     what = "photos do not show the points where the cameras see them" if unlike else "the cameras see no points"
     for other, remedy in (

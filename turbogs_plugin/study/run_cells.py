@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from turbogs_plugin.distributed.processes import end_with_parent
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import Provenance, provenance
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.agreement import require_agreement
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.results import Study, StudyFolder, changes, flat_settings
@@ -129,8 +130,7 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
             kept = {result.key: result for result in folder.read_study().results}
             if not mine or key in kept:
                 continue
-            given = config.scene
-            scene, digest, loading = _loaded(given.path, given.factor, given.test_every, config.train.refine_cameras)
+            scene, digest, loading = _loaded(*astuple(config.scene), config.train.refine_cameras)
             if any(cell.scene == key.scene and cell.capture not in ("", digest) for cell in kept.values()):
                 raise InputError(f"'{key.scene}' has other photos than its kept cells: choose a new --out")
             try:
@@ -150,10 +150,12 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
 
 
 @lru_cache(maxsize=2)  # with refined cameras and without
-def _loaded(path: str, factor: int, test_every: int, refined: bool) -> tuple[Scene, str, float]:
+def _loaded(path: str, factor: int, test_every: int, force: bool, refined: bool) -> tuple[Scene, str, float]:
     """Capture, its digest, and the seconds in which it was loaded. It stays for the next cells."""
     started = time.perf_counter()
     scene = load_scene(path, factor, test_every)
+    if not force:
+        require_agreement(scene)
     return refine_cameras(scene, refined), capture_digest(scene), time.perf_counter() - started
 
 

@@ -2,7 +2,7 @@
 
 A run's folder ``checkpoints/`` holds ``iteration-NNNNNN.pt`` files, each put in place by one rename, so every one is
 complete and the newest is that of the latest iteration. What a checkpoint holds: `RunSession.state_dict` and
-`Trainer.state_dict`.
+`TrainingState.state_dict`.
 """
 
 from __future__ import annotations

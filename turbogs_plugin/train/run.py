@@ -156,7 +156,7 @@ def resume(
 ) -> RunSession:
     """Go on with a stopped run from its newest checkpoint, with its own configuration, in which nothing is `auto`.
 
-    On a CPU, the result is bit for bit that of a run never stopped; `Trainer.state_dict` says why.
+    On a CPU, the result is bit for bit that of a run never stopped; `TrainingState.state_dict` says why.
 
     Args:
         report, clock, ranks, watch: as in `train`. The number of processes may be another than before.
