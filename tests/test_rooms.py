@@ -67,15 +67,12 @@ Whoever needs more takes something out, or says in the change which measured gai
 """
 
 STILL_LARGER = {
-    "turbogs_plugin": 23_480,
-    "turbogs_plugin/{types,tiles,masks,error_maps}": 1_185,
-    "turbogs_plugin/distributed": 1_196,
-    "turbogs_plugin/model": 968,
+    "turbogs_plugin": 23_220,
+    "turbogs_plugin/{types,tiles,masks,error_maps}": 1_147,
+    "turbogs_plugin/distributed": 1_159,
+    "turbogs_plugin/model": 941,
     "turbogs_plugin/captures": 2_926,
-    "turbogs_plugin/scene": 1_240,
-    "turbogs_plugin/{config,plan}": 1_503,
-    "turbogs_plugin/train": 2_326,
-    "turbogs_plugin/export": 745,
+    "turbogs_plugin/train": 2_311,
 }
 """Folder or modules above their budget -> lines that they have. They only shrink; within the budget, an entry goes."""
 

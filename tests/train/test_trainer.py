@@ -312,11 +312,14 @@ class OwnLoss(SparseLoss):
         ("loss", OwnLoss, r"returned pixel_errors of shape \(\d+, 3\), not \(\d+,\)"),
     ],
 )
-def test_what_a_strategy_of_ones_own_returns_is_refused(capture, tmp_path, monkeypatch, part, strategy, message):
+def test_what_a_strategy_of_ones_own_returns_is_refused_and_nothing_is_left(
+    capture, tmp_path, monkeypatch, part, strategy, message
+):
     built = Config.build
     monkeypatch.setattr(Config, "build", lambda self, kind: strategy() if kind == part else built(self, kind))
     with pytest.raises(InputError, match=message):
         run.train(tiny_config(capture, "schedule.min_views=3", "view_sampler.type=random"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_folder_that_cannot_be_written_is_not_resumed(capture, tmp_path, monkeypatch):

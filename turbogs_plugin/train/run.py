@@ -119,7 +119,7 @@ def train(
         watch: further listeners.
 
     Raises:
-        InputError: anything wrong with the input; then nothing was written, unless a strategy says so in an iteration.
+        InputError: anything wrong with the input; then nothing was written.
         TrainingStopped: the run cannot go on; the files that it saved stay.
     """
     clock = clock or WallClock()

@@ -39,6 +39,13 @@ class RunFolder:
             raise InputError(f"--out '{self.path}' is not empty: choose a new folder, or go on with a run by --resume")
         require_writable(self.path, f"--out '{self.path}'")
 
+    def discard(self) -> None:
+        """Remove what a run wrote that never came to a checkpoint, and the folder if nothing else is in it."""
+        for file in (self.asked, self.config, self.plan, self.history):
+            file.unlink(missing_ok=True)
+        if self.path.is_dir() and not any(self.path.iterdir()):
+            self.path.rmdir()
+
     def finished(self, reported: bool) -> bool:
         """Whether nothing of the run is left to do: its model is there, which is written at the end, and its report if
         that is `reported`."""

@@ -112,6 +112,10 @@ class RunSession(Listener):
             write_text_atomically(self.folder.wall, json.dumps(asdict(self.wall), indent=1) + "\n")
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
+        except InputError:  # in an iteration: from a strategy of one's own, say
+            if ranks.first and latest_checkpoint(self.folder.checkpoints) is None:
+                self.folder.discard()
+            raise
         except torch.cuda.OutOfMemoryError as error:
             raise TrainingStopped(
                 f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)} "
