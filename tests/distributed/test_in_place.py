@@ -16,7 +16,7 @@ from helpers.processes import ended, grouped, said, start_ranks
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import Config, load_config
-from turbogs_plugin.distributed import in_place, peer_memory
+from turbogs_plugin.distributed import in_place, peer_memory, ranks_engine
 from turbogs_plugin.distributed.in_place import DRAWN, STEPPED, WRITTEN, InPlace
 from turbogs_plugin.distributed.messages import rows_of
 from turbogs_plugin.distributed.peer_memory import PeerMemory, aligned_starts, share_memory
@@ -86,7 +86,7 @@ def same(first: dict, second: dict) -> None:
 def every_case(capture: Path, folder: Path) -> None:
     """In every process: each case by messages and in place; the memory grows by an event of density control."""
     ranks, wanted = grouped(), {}
-    in_place.LEAST = 0  # these memories are files
+    ranks_engine.OWNERS_FROM = in_place.LEAST = 0  # rows have owners in messages, too; these memories are files
     for name in CASES if ranks.count == 2 else OF_THREE:
         trainer = trainer_of(capture, ranks, PeerFiles(folder / f"{name}-messages", most=0), *CASES[name])
         wanted[name] = run(trainer, False)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.distributed import ranks_engine
 from turbogs_plugin.distributed.messages import rows_of
 from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, Ranks
 from turbogs_plugin.engine import Engine
@@ -45,9 +46,10 @@ CASES = {
     "masked": ("schedule.min_views=7", "schedule.max_views=7"),
     "masked tiles": ("pixel_sampler.unit=tile", "schedule.type=fixed", "schedule.views=2"),
     "hosted": ("train.pixels_place=host",),
+    "all records": (),
 }
-"""Name -> overrides. A masked case is of the capture with masks."""
-WITH_EVENTS = ("usual", "fastgs")
+"""Name -> overrides. A masked case is of the capture with masks. In all but the last one rows have owners."""
+WITH_EVENTS = ("usual", "fastgs", "all records")
 GO_ON = (*WITH_EVENTS, "no rule", "exposures", "masked", "hosted")
 """What these have beside the model changes from step to step; of the others, the first step says all."""
 
@@ -105,7 +107,9 @@ def steps_with_an_event(trainer: Trainer) -> dict:
 def every_case(capture: Path, out: Path, cases: tuple[str, ...]) -> None:
     """In every process: these cases, each compared after every step; the first process keeps what they gave."""
     ranks, results = grouped(), {}
+    usual = ranks_engine.OWNERS_FROM
     for name in cases:
+        ranks_engine.OWNERS_FROM = usual if name == "all records" else 0  # small models have no owners by themselves
         trainer = case_of(capture, name, ranks)
         trainer.initialise_maps()
         trainer.complete()
@@ -114,6 +118,7 @@ def every_case(capture: Path, out: Path, cases: tuple[str, ...]) -> None:
         results[name] = state_of(trainer)
         if name in GO_ON:
             results[name]["event"] = steps_with_an_event(trainer)
+    ranks_engine.OWNERS_FROM = 0
     results["broken"] = broken_ranks(capture, ranks)
     if ranks.first:
         torch.save(results, out / "results.pt")
