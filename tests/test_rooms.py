@@ -22,16 +22,7 @@ def test_few_modules_stand_beside_the_packages():
     root = Path(turbogs_plugin.__file__).parent
     modules = {path.stem for path in root.glob("*.py")} - {"__init__"}
     assert modules <= {
-        "tiles",
-        "masks",
-        "errors",
-        "error_maps",
-        "files",
-        "device",
-        "yaml_json",
-        "cli",
-        "doctor",
-        "__main__",
+        *["tiles", "masks", "errors", "error_maps", "files", "device", "yaml_json", "cli", "doctor", "__main__"]
     }
 
 

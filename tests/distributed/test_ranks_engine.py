@@ -6,12 +6,14 @@ import copy
 import shutil
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_settings
+from helpers.models import random_gaussians
 from helpers.processes import ended, grouped, said, start_ranks
 from PIL import Image
 from torch import Tensor
@@ -21,7 +23,9 @@ from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed import ranks_engine
 from turbogs_plugin.distributed.messages import rows_of
 from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, Ranks
+from turbogs_plugin.distributed.ranks_engine import RanksEngine
 from turbogs_plugin.engine import Engine
+from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.torch_file import leaves
 from turbogs_plugin.strategies.density import fastgs
@@ -258,3 +262,12 @@ def test_rows_are_owned_in_aligned_runs():
         assert [part.start for part in rows[1:]] == [part.stop for part in rows[:-1]]
         assert rows[0].start == 0 and rows[-1].stop == count
         assert all(part.start % 4 == 0 or part.start == count for part in rows)
+
+
+def test_skipped_updates_of_every_owner_count():
+    engine, moments = RanksEngine.__new__(RanksEngine), GaussianMoments.zeros(random_gaussians(4))
+    engine.ranks, engine._owned, engine._skipped = SimpleNamespace(gather_numbers=lambda own: [[2], own, [5]]), True, 10
+    moments.skipped.fill_(13)
+    with patch("turbogs_plugin.distributed.ranks_engine.gather_rows"):
+        engine.complete(moments, None)
+    assert int(moments.skipped) == 10 + 2 + 3 + 5

@@ -301,3 +301,15 @@ def test_settings_are_used():
 def test_settings_out_of_bounds_are_refused(values):
     with pytest.raises(InputError, match=f"{list(values)[-1]} = "):
         RasterSettings(**values)
+
+
+def test_shares_of_the_loss_are_of_the_filled_slots():
+    gaussians, cameras = make_gaussians(40), make_cameras(SIZES)
+    shares = []
+    for empty in (0, 5):
+        samples = thin_out(dense_samples(cameras), 0.3, empty_slots=empty)
+        colors = torch.ones(len(samples), 3, dtype=torch.float64)
+        screen = rasterize(gaussians, cameras, samples).backward(colors, colors[:, 0])
+        shares.append(screen.parameter_gradients(rows=True).view_losses)
+    torch.testing.assert_close(*shares)
+    assert shares[0].any()

@@ -10,9 +10,7 @@ from helpers.raster_extremes import CASES
 from helpers.squares import SQUARES, event_at, small_model, spread_squares, window
 from helpers.statistics_cases import (
     STIFF,
-    assert_gradients_that_overflow_are_survived,
-    assert_gradients_that_vanish_are_survived,
-    assert_squares_that_overflow_are_survived,
+    SURVIVED,
     share_of_bound,
 )
 from helpers.statistics_errors import CASES as MEASURED
@@ -53,14 +51,7 @@ def test_all_absolute_gradients_share_the_colours_gradient(case):
     assert share_of_bound(case, "cuda") <= 1
 
 
-@pytest.mark.parametrize(
-    "assert_survived",
-    [
-        assert_squares_that_overflow_are_survived,
-        assert_gradients_that_overflow_are_survived,
-        assert_gradients_that_vanish_are_survived,
-    ],
-)
+@pytest.mark.parametrize("assert_survived", SURVIVED)
 def test_what_overflows_or_vanishes(assert_survived):
     assert_survived("cuda")
 

@@ -307,3 +307,10 @@ def test_squares_and_absgrad_must_be_there_or_off():
 def test_invalid_fields_are_refused(field, value):
     with pytest.raises(InputError, match=field):
         TurboDensityStrategy(**{field: value})
+
+
+def test_the_step_where_gsplat_does_not_refine_yet_keeps_the_window():
+    host = Host(TurboDensityStrategy(refine_start_iter=3, refine_every=3, refine_stop_iter=12))
+    for step in range(4):
+        host.step(step)
+    assert float(host.state["view_counts"].max()) == 4 * 3  # steps times cameras

@@ -89,3 +89,10 @@ def assert_gradients_that_overflow_are_survived(device: str) -> None:
     update = event(gaussians, stats, max_gaussians=50, prune_score_fraction=0.3)
     assert update is not None and set(torch.nonzero(drawn).squeeze(-1).tolist()) <= set(update.source.tolist())
     assert all(value.isfinite().all() for _, value in update.apply(gaussians).items())
+
+
+SURVIVED = (
+    assert_squares_that_overflow_are_survived,
+    assert_gradients_that_overflow_are_survived,
+    assert_gradients_that_vanish_are_survived,
+)

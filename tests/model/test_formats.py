@@ -99,3 +99,12 @@ def test_a_damaged_spz_is_refused(tmp_path, damage):
     file.write_bytes({"cut": content[:-5], "longer": content[:40] + b"abc" + content[40:], "other": b"ply\nno"}[damage])
     with pytest.raises(InputError, match=file.name):
         FORMATS["spz"].read(file)
+
+
+def test_spz_turns_rotations_and_harmonics_to_its_axes(tmp_path):
+    quats, harmonics = torch.tensor([[0.8, 0.2, 0.4, 0.4]]), torch.full((1, 3, 3), 0.5)
+    one = Gaussians(torch.zeros(1, 3), quats, torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3), harmonics)
+    FORMATS["spz"].write(one, tmp_path / "m", Frame(np.zeros(3), 1.0), 0)
+    body, minus = gzip.decompress((tmp_path / "m").read_bytes())[16:], 1 << 9
+    assert int.from_bytes(body[16:20], "little") == 3 << 30 | 145 << 20 | (289 | minus) << 10 | (289 | minus)
+    assert list(body[20:]) == [64] * 6 + [192] * 3  # y and z change their sign, x does not

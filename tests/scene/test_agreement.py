@@ -31,9 +31,7 @@ def inverted(scene: Scene) -> Scene:
 
 
 def shares(scene: Scene) -> Scene:
-    Ks = scene.train.cameras.Ks.clone()
-    Ks[:, 0] /= 64.0
-    Ks[:, 1] /= 48.0
+    Ks = scene.train.cameras.Ks / torch.tensor([[64.0], [48.0], [1.0]])
     cameras = Cameras(scene.train.cameras.viewmats, Ks, scene.train.cameras.sizes)
     return replace(scene, train=replace(scene.train, cameras=cameras))
 

@@ -152,3 +152,13 @@ def test_damaged_masks(capture, tmp_path):
         else:
             assert result.train.masks is None or (result.train.masks.pixel_counts > 0).all()
     assert 10 < refused < 33
+
+
+@pytest.mark.parametrize("name", ["means", "opacities", "shN"])
+def test_a_saved_model_that_is_not_finite_is_not_handed_out(finished, tmp_path, name):
+    shutil.copytree(finished, tmp_path / "run")
+    state = load_checkpoint(latest_checkpoint(finished / "checkpoints"))
+    state["trainer"]["gaussians"][name].view(-1)[0] = torch.nan
+    save_checkpoint(tmp_path / "run/checkpoints", 3, state)
+    with pytest.raises(InputError, match="not finite"):
+        load_model(tmp_path / "run", torch.device("cpu"))

@@ -10,9 +10,7 @@ import torch
 from helpers.raster_extremes import CASES, TWO_VIEWS, random_scene
 from helpers.statistics_cases import (
     STIFF,
-    assert_gradients_that_overflow_are_survived,
-    assert_gradients_that_vanish_are_survived,
-    assert_squares_that_overflow_are_survived,
+    SURVIVED,
     pass_statistics,
     share_of_bound,
 )
@@ -44,14 +42,7 @@ def test_all_absolute_gradients_share_the_colours_gradient(case):
     assert share <= 1
 
 
-@pytest.mark.parametrize(
-    "assert_survived",
-    [
-        assert_squares_that_overflow_are_survived,
-        assert_gradients_that_overflow_are_survived,
-        assert_gradients_that_vanish_are_survived,
-    ],
-)
+@pytest.mark.parametrize("assert_survived", SURVIVED)
 def test_what_overflows_or_vanishes(assert_survived):
     assert_survived("cpu")
 

@@ -176,3 +176,25 @@ def test_exposed_is_the_affine_map_of_each_colour():
     look = Look(0, RasterSettings(), exposures=torch.stack([torch.zeros(3, 4), exposure]))
     torch.testing.assert_close(look.colors(colors, 1).reshape(-1, 3), torch.stack(wanted).clamp(0, 1))
     assert (look.colors(colors, 0) == colors).all()
+
+
+def test_an_iteration_exposes_its_colours_once(scene):
+    trainer = trainer_of(scene, *ON, "maps.beta=1")
+    trainer.exposures.offsets[:] = torch.linspace(-0.3, 0.2, 84).view(7, 3, 4)
+    expected, step = [trainer.dense_errors(view) for view in range(7)], trainer.now
+    trainer.step()
+    for view, wanted in enumerate(expected):
+        drawn = trainer.maps.ages(view, step) == 0
+        assert drawn.any()
+        torch.testing.assert_close(trainer.maps.view_errors(view)[drawn], wanted[drawn], rtol=0, atol=2e-3)
+
+
+def test_the_maps_begin_with_each_exposure_applied_once(scene):
+    trainer, view = trainer_of(scene, "train.exposure=true"), DARK
+    trainer.exposures.offsets[view] = torch.linspace(-0.3, 0.2, 12).view(3, 4)
+    trainer.initialise_maps()
+    photo, exposure = trainer.views.photos.image(view), trainer.exposures.offsets[view]
+    image = render_image(trainer.gaussians, trainer.views.cameras, view, sh_degree=0, settings=trainer.config.raster)
+    shown = image.colors + image.colors @ exposure[:, :3].T + exposure[:, 3]
+    wanted = (shown - photo).abs().sum(dim=2).view(-1)
+    torch.testing.assert_close(trainer.maps.view_errors(view), wanted, rtol=0, atol=2e-3)

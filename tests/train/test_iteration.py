@@ -15,7 +15,7 @@ from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.engine.rules import Dropout
 from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.metrics import evaluate, render_view
-from turbogs_plugin.train.trainer import DROPOUT_UNTIL, Trainer
+from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import RowUpdate
 
 CPU = torch.device("cpu")
@@ -114,20 +114,35 @@ def test_an_evaluation_measures_what_a_screen_shows(scene):
     assert metrics.mean.l1 <= 1.0 and metrics.mean.psnr >= 0.0
 
 
-def test_what_an_iteration_leaves_out_does_not_learn_and_the_end_has_all(scene):
+def test_what_an_iteration_leaves_out_does_not_learn_and_the_end_has_all(scene, monkeypatch):
     still = ("density.refine_from=1000", "density.final_keep=1", "train.distant_size=0")
     trainer = make_trainer(scene, "train.dropout=0.4", "train.iterations=20", *still)
     trainer.initialise_maps()
+    render, shares = trainer.engine.render, []
+    monkeypatch.setattr(trainer.engine, "render", lambda *all: shares.append(all[3].dropout.share) or render(*all))
     ever_left = torch.zeros(len(trainer.gaussians), dtype=torch.bool)
-    for iteration in range(20):
-        share = 0.4 if iteration < DROPOUT_UNTIL * 20 else 0.0
-        stay = kept(Dropout(share, trainer.config.train.seed, iteration), len(trainer.gaussians), CPU)
-        assert (stay is None) == (iteration >= 19)  # 0.95 of 20
+    for iteration in range(19):  # 0.95 of 20
+        stay = kept(Dropout(0.4, trainer.config.train.seed, iteration), len(trainer.gaussians), CPU)
         before = trainer.gaussians.map(torch.clone)
         trainer.step()
-        if stay is not None:
-            ever_left |= ~stay
-            for name, value in trainer.gaussians.items():
-                assert torch.equal(value[~stay], getattr(before, name)[~stay])
-            assert not torch.equal(trainer.gaussians.means[stay], before.means[stay])
-    assert ever_left.double().mean() > 0.99
+        ever_left |= ~stay
+        for name, value in trainer.gaussians.items():
+            assert torch.equal(value[~stay], getattr(before, name)[~stay])
+        assert not torch.equal(trainer.gaussians.means[stay], before.means[stay])
+    trainer.step()
+    assert ever_left.double().mean() > 0.99 and shares == [0.4] * 19 + [0.0]
+
+
+def test_the_mean_begins_anew_where_rows_change_places(scene):
+    trainer = make_trainer(scene, "train.average_last=1.0")
+    trainer.parameter_mean.add(trainer.learnt())
+    rows = torch.arange(len(trainer.gaussians)).flip(0)  # as many as before
+    trainer.change_rows(RowUpdate(rows, torch.zeros(len(rows), dtype=torch.bool), {}))
+    assert trainer.parameter_mean.count == 0
+
+
+def test_bands_begin_at_their_iterations(scene):
+    trainer, degrees = make_trainer(scene, "train.sh_degree=2", "train.sh_interval=4"), []
+    for trainer.iteration in range(10):
+        degrees.append(trainer.sh_degree)
+    assert degrees == [0] * 4 + [1] * 4 + [2] * 2

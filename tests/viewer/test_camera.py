@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from turbogs_plugin.types import Cameras
 from turbogs_plugin.viewer.camera import FOV_LIMITS, LARGEST_SIDE, SMALLEST_SIDE, ViewerCamera
 
 GOOD = {"position": (1.0, 2.0, 3.0), "wxyz": (2.0, 0.0, 0.0, 0.0), "fov": 1.0, "width": 640, "height": 480}
@@ -47,3 +48,9 @@ def test_the_camera_of_a_view_is_that_of_the_capture(scene):
         torch.testing.assert_close(found.viewmats[0], cameras.viewmats[view], atol=1e-5, rtol=0)
         assert found.Ks[0, 1, 1].item() == pytest.approx(cameras.Ks[view, 1, 1].item(), rel=1e-5)
         assert np.array_equal(found.sizes[0], cameras.sizes[view])
+
+
+def test_the_angle_of_a_view_is_vertical_where_pixels_are_not_square():
+    K = torch.tensor([[[300.0, 0.0, 32.0], [0.0, 200.0, 24.0], [0.0, 0.0, 1.0]]])
+    camera = ViewerCamera.of_view(Cameras(torch.eye(4)[None], K, np.array([[64, 48]])), 0)
+    assert camera.fov == pytest.approx(2 * math.atan(48 / (2 * 200)))

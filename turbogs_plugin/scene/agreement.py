@@ -66,7 +66,7 @@ def _contradiction(scene: Scene) -> str:
 
 
 def likeness(scene: Scene, poses: np.ndarray) -> tuple[int, float]:
-    """Number of visible points over all training photos, and the correlation of their colours with the photos' colours
+    """Number of visible points over the examined photos, and the correlation of their colours with the photos' colours
     there; NaN where either are all alike. `poses`: [V, 4, 4] world to camera, in the capture's coordinates."""
     views, rows = scene.train, evenly(len(scene.points), MOST_POINTS)
     points = scene.frame.restore_points(scene.points[rows].double().cpu().numpy())  # [M, 3]
