@@ -190,10 +190,7 @@ class InPlace:
         radii, records = (part.storage_offset() + start for start in self._starts[2:4])
         shapes = [((views, gaussians, size), (gaussians * size, size, 1)) for size in (RECORD, RADII)]
         # By as_strided, one operation: slicing takes the host as long as a launch does.
-        return ScreenRecords(
-            part.as_strided(*shapes[0], records),
-            part.as_strided(*shapes[1], radii).view(torch.int32),
-        )
+        return ScreenRecords(part.as_strided(*shapes[0], records), part.as_strided(*shapes[1], radii).view(torch.int32))
 
 
 def _laid_out(like: Gaussians, part: Tensor, starts: Sequence[int]) -> Gaussians:

@@ -118,8 +118,9 @@ def _linked() -> bool:
     Barriers need atomic operations in the other GPU's memory, which PCIe has not.
     """
     name = f"GPU-{torch.cuda.get_device_properties(torch.cuda.current_device()).uuid}"
+    command = ["nvidia-smi", "nvlink", "--status", "--id", name]
     try:
-        asked = subprocess.run(["nvidia-smi", "nvlink", "--status", "--id", name], capture_output=True, text=True)
-    except OSError:
+        asked = subprocess.run(command, capture_output=True, text=True, timeout=PROOF_MILLISECONDS / 1000)
+    except (OSError, subprocess.TimeoutExpired):
         return True
     return asked.returncode != 0 or "GB/s" in asked.stdout  # of a link that is up

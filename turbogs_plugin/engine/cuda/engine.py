@@ -75,8 +75,8 @@ class CudaEngine(SharedEngine):
         return colors
 
     def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
-        # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel.
-        # If only one of the two is in host memory, they do not.
+        # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel,
+        # as a trainer places them; a caller may place them otherwise.
         photos, starts = truth.photos.colors, update.maps.offsets[list(truth.samples.view_ids)]
         aligned = len(photos) == len(update.maps.errors) and truth.starts.tolist() == starts.tolist()
         targets = photos if aligned else truth.colors()
