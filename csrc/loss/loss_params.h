@@ -1,4 +1,4 @@
-// Parameters of the kernels of the loss. No torch here. Index spaces as in turbogs_plugin/types: K
+// Parameters of the kernels of the loss and the exposures. No torch here. Index spaces as in turbogs_plugin/types: K
 // views of the batch, P sample slots, T tiles with samples, X flat pixels of all V training views.
 #pragma once
 
@@ -46,8 +46,49 @@ struct SparseLossParams {
     int16_t stamp;
 };
 
+// ---- Exposures, which turbogs_plugin/engine/exposures.py defines ----------------------------------
+
+constexpr int kExposureNumbers = 12;  // of a photo's map less the identity: rows of A | b
+
+// Samples with their views, and the maps.
+struct ExposedSamples {
+    int num_views;  // K
+    int num_tiles;  // T
+    SampleView views[kMaxViews];
+    const int32_t* tile_ids;      // [T]
+    const int32_t* tile_offsets;  // [T + 1]
+    const float* colors;          // [P, 3]
+    const float* offsets;         // [V, 3, 4]
+};
+
+struct ExposeColorsParams : ExposedSamples {
+    float* exposed;  // [P, 3] out
+};
+
+struct ExposureBackwardParams : ExposedSamples {
+    float* gradients;  // [P, 3] in: of the exposed colours; out: of the colours
+    double* sums;      // [K, 3, 4] added to
+};
+
+struct ExposureStepParams {
+    int num_views;   // K
+    int num_photos;  // V
+    SampleView views[kMaxViews];
+    const double* sums;       // [K, 3, 4]
+    float* offsets;           // [V, 3, 4], as are the moments
+    float* exp_avg;           // changed in place, all four
+    float* exp_avg_sq;
+    int32_t* steps;           // [V]
+    const int32_t* overflow;  // [1] where not 0, nothing changes; or null
+    double beta1, beta2;
+    float rate, eps, pull;
+};
+
 // A launcher only enqueues work on `stream`; `call` in bindings/library.cpp looks for its errors.
 void launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream);
+void launch_expose_colors(const ExposeColorsParams& params, cudaStream_t stream);
+void launch_exposure_backward(const ExposureBackwardParams& params, cudaStream_t stream);
+void launch_exposure_step(const ExposureStepParams& params, cudaStream_t stream);
 
 // For launch_sparse_loss: SSIM's part, where T is not 0, after the rest is enqueued.
 void launch_window_similarity(const SparseLossParams& params, cudaStream_t stream);

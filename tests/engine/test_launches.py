@@ -17,6 +17,7 @@ from turbogs_plugin import engine
 from turbogs_plugin.engine import ReferenceEngine, layout
 from turbogs_plugin.engine.cuda import launches, library, raster
 from turbogs_plugin.engine.cuda.training import view_rows
+from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS
 from turbogs_plugin.engine.rules import LossTerms, ParameterRates
@@ -25,7 +26,7 @@ from turbogs_plugin.types import TILE_SIZE, Gaussians, GaussianStats, LossOutput
 CSRC = Path(__file__).resolve().parents[2] / "csrc"
 LISTS = ("Tensors", "Integers", "Reals")
 ROWS = [value for value in vars(layout).values() if isinstance(value, type)]
-OBJECTS = (Gaussians, GaussianStats, GaussianMoments, ParameterRates, PixelSamples, LossTerms, LossOutput)
+OBJECTS = (Gaussians, GaussianStats, GaussianMoments, ParameterRates, PixelSamples, LossTerms, LossOutput, Exposures)
 """Classes of the package whose fields launches read, by the names that `launches` has for them."""
 
 

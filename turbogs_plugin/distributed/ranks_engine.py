@@ -74,6 +74,7 @@ class RanksEngine:
     ) -> None:
         self.engine, self.ranks, self.device = engine, ranks, device
         self.draw, self.evaluate, self.learn = engine.draw, engine.evaluate, engine.learn
+        self.expose, self.learn_exposures = engine.expose, engine.learn_exposures
         self.evaluate_and_learn, self.supervise = engine.evaluate_and_learn, engine.supervise
         self.memory, self.messages = InPlace(ranks, share), Messages(ranks)
         self._exchange: InPlace | Messages = self.messages  # of the latest pass

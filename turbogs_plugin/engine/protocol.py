@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from turbogs_plugin.engine.exposures import Exposures, expose, exposure_gradients, step_exposures
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
@@ -101,6 +102,29 @@ class Engine(Protocol):
     def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         """`evaluate` against the photos at the samples, then `learn`. `colors`: [P, 3], on the engine's device."""
         return self.evaluate_and_learn(terms, colors, truth.colors(), truth.samples, update)
+
+    def expose(self, exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
+        """[P, 3] float32: rendered colours [P, 3] as the exposure of each sample's photo shows them."""
+        return expose(exposures, colors, samples)
+
+    def learn_exposures(
+        self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
+    ) -> Tensor:
+        """Take gradients back through `expose`, and make one step of Adam with the exposures of the batch, in place.
+
+        A skipped iteration (see `overflow`) changes no exposure.
+
+        Args:
+            colors: [P, 3], as given to `expose`.
+            gradients: [P, 3], d loss / d exposed colours; it cannot be used again.
+            rate: Adam's.
+
+        Returns:
+            [P, 3] float32, d loss / d colours.
+        """
+        of_colors, sums = exposure_gradients(exposures, colors, gradients, samples)
+        step_exposures(exposures, sums, samples.view_ids, rate, self.overflow)
+        return of_colors
 
     @abstractmethod
     def update(

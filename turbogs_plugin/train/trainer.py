@@ -14,7 +14,7 @@ from torch import Tensor
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine, engine_of
-from turbogs_plugin.engine.exposures import exposure_gradients, exposure_rate, step_exposures
+from turbogs_plugin.engine.exposures import exposure_rate
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import Dropout
@@ -128,8 +128,8 @@ class Trainer(TrainingState):
             self.engine.learn(samples, shown, loss, update)
         if self.exposures is None:
             return loss
-        gradients, sums = exposure_gradients(self.exposures, colors, loss.color_gradients, samples)
-        step_exposures(self.exposures, sums, samples.view_ids, exposure_rate(step), self.engine.overflow)
+        rate = exposure_rate(step)
+        gradients = self.engine.learn_exposures(self.exposures, colors, loss.color_gradients, samples, rate)
         return replace(loss, color_gradients=gradients)
 
     def update(self, screen: ScreenGradients, stats: GaussianStats | None, step: Step) -> None:

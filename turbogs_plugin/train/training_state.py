@@ -15,7 +15,7 @@ from torch import Tensor
 from turbogs_plugin.captures.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine
-from turbogs_plugin.engine.exposures import Exposures, expose
+from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, TrainingStopped
@@ -140,7 +140,7 @@ class TrainingState:
 
     def shown(self, colors: Tensor, samples: PixelSamples) -> Tensor:
         """[P, 3]: the model's colours at samples [P, 3], with the exposures of their photos where there are any."""
-        return colors if self.exposures is None else expose(self.exposures, colors, samples)
+        return colors if self.exposures is None else self.engine.expose(self.exposures, colors, samples)
 
     def learnt(self) -> dict[str, Tensor]:
         """All tensors that iterations learn, by name: the model's, and the exposures of the photos."""

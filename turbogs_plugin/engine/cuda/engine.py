@@ -17,6 +17,7 @@ from turbogs_plugin.engine.cuda.raster import (
     scene_of,
 )
 from turbogs_plugin.engine.cuda.workspace import Workspace
+from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, RenderOptions, ScreenRecords
 from turbogs_plugin.engine.rules import LossTerms
@@ -43,6 +44,7 @@ class CudaEngine(SharedEngine):
     draw = staticmethod(training.sample_pixels)
     evaluate = staticmethod(training.sparse_loss)
     update = staticmethod(training.fused_step)
+    expose = staticmethod(training.expose_colors)
 
     def render(
         self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions = DEFAULT_OPTIONS
@@ -87,6 +89,11 @@ class CudaEngine(SharedEngine):
         self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
     ) -> LossOutput:
         return training.sparse_loss(terms, colors, targets, samples, update, self.overflow, workspace=self.workspace)
+
+    def learn_exposures(
+        self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
+    ) -> Tensor:
+        return training.learn_exposures(exposures, colors, gradients, samples, rate, self.overflow)
 
     def settle(self, wait: bool = False) -> int:
         return 0 if self.workspace is None else self.workspace.take_lost(wait)

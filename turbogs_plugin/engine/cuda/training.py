@@ -1,7 +1,8 @@
-"""Python functions for the training kernels: sampling, loss, projection backward with the optimizer's step.
+"""Python functions for the training kernels: sampling, loss, projection backward with the optimizer's step, exposures.
 
 Each function does what its torch twin in `engine.reference` defines: `draws.draw_pixels`, `losses.sparse_loss` with
-`ErrorMaps.update`, `raster.ReferenceScreenGradients.parameter_gradients` with `update.apply_update`. It is enqueued on
+`ErrorMaps.update`, `raster.ReferenceScreenGradients.parameter_gradients` with `update.apply_update`, and
+`engine.exposures`. It is enqueued on
 torch's current stream and does not wait. Tensors must be contiguous. A wrong device, dtype or shape, or a batch without
 a view or with more than `MAX_VIEWS`, raises `RuntimeError`, which names the tensor and what was expected.
 """
@@ -12,6 +13,7 @@ from collections.abc import Sequence
 from functools import lru_cache, partial
 from itertools import pairwise
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +22,7 @@ from torch import Tensor
 from turbogs_plugin.engine.cuda import launches, library
 from turbogs_plugin.engine.cuda.raster import Buffers, CudaScreenGradients, count_filled, plain_floats
 from turbogs_plugin.engine.cuda.workspace import Workspace
+from turbogs_plugin.engine.exposures import BETA1, BETA2, EPSILON, PULL, Exposures
 from turbogs_plugin.engine.layout import MAX_PEERS, SAMPLE_UNITS, STRUCTURES, UPDATE_KINDS
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.protocol import MapUpdate
@@ -231,3 +234,46 @@ def _copies(copies: ModelCopies | None) -> SimpleNamespace:
         return launches.NO_COPIES
     distances = (*copies.distances, *(0,) * (MAX_PEERS - 1 - len(copies.distances)))
     return SimpleNamespace(**{f"copy_{place}": distance for place, distance in enumerate(distances)})
+
+
+def expose_colors(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
+    """`Engine.expose`."""
+    launch = launches.ExposeColors(
+        **_exposed(exposures, plain_floats(colors), samples),
+        exposed=torch.empty(len(colors), 3, device=colors.device),
+    )
+    library.launch(launch)
+    return launch.exposed
+
+
+def learn_exposures(
+    exposures: Exposures,
+    colors: Tensor,
+    gradients: Tensor,
+    samples: PixelSamples,
+    rate: float,
+    overflow: Tensor | None = None,
+) -> Tensor:
+    """`Engine.learn_exposures`, in two launches; `gradients`, where float32 and contiguous, is changed in place."""
+    exposed = _exposed(exposures, plain_floats(colors), samples)
+    backward = launches.ExposureBackward(
+        **exposed,
+        gradients=plain_floats(gradients),
+        sums=torch.zeros(len(samples.view_ids), 3, 4, dtype=torch.float64, device=colors.device),
+    )
+    library.launch(backward)
+    adam = {"rate": rate, "beta1": BETA1, "beta2": BETA2, "eps": EPSILON, "pull": PULL}
+    library.launch(launches.ExposureStep(backward.sums, backward.views, backward.grid, exposures, overflow, **adam))
+    return backward.gradients
+
+
+def _exposed(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> dict[str, Any]:
+    """Arguments of `launches.ExposedViews`. `colors`: [P, 3] float32, contiguous."""
+    return {
+        "colors": colors,
+        "tile_ids": samples.tile_ids,
+        "tile_offsets": samples.tile_offsets,
+        "views": view_rows([0] * len(samples.view_ids), samples.sizes.tolist(), samples.view_ids),
+        "grid": launches.GridOrigin(*samples.origin),
+        "offsets": exposures.offsets,
+    }

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
+    from turbogs_plugin.engine.exposures import Exposures
     from turbogs_plugin.engine.moments import GaussianMoments
     from turbogs_plugin.engine.render_pass import RasterSettings as BlendSettings
     from turbogs_plugin.engine.render_pass import RasterSettings as ProjectionSettings
@@ -50,6 +51,7 @@ else:  # the fields that launches read of these
     LossTerms = fields_of(float="epsilon l1_weight structure_weight variance_constant", bool="balance")
     LossOutput = fields_of(Tensor="loss color_gradients pixel_errors")
     ErrorMaps = fields_of(Tensor="errors stamps view_sums")  # [X] float16, [X] int16, [V] float64
+    Exposures = fields_of(Tensor="offsets exp_avg exp_avg_sq steps")
 
 __all__ = ["LAUNCHES", "Launch", "field_types", "nested_type"]
 
@@ -273,6 +275,49 @@ class SparseLoss(Launch):
     nonfinite_losses: Tensor | None  # [] int64, 1 is added if the loss is not finite
     overflow: Tensor | None  # [1] int32; if not 0, the maps stay as they are
     background: Background  # shows through photos with an alpha
+
+
+@dataclass
+class ExposedViews:
+    """Rendered colours, and the exposures of their photos."""
+
+    colors: Tensor  # [P, 3] float32
+    tile_ids: Tensor  # [T] int32
+    tile_offsets: Tensor  # [T + 1] int32
+    views: list[int]  # [K] layout.ViewRow
+    grid: GridOrigin
+    offsets: Tensor  # [V, 3, 4] float32
+
+
+@dataclass
+class ExposeColors(ExposedViews, Launch):
+    """Map the colours by the exposures: writes `exposed`."""
+
+    exposed: Tensor  # [P, 3] float32
+
+
+@dataclass
+class ExposureBackward(ExposedViews, Launch):
+    """Gradients through `ExposeColors`: changes `gradients` in place, adds to `sums`."""
+
+    gradients: Tensor  # [P, 3] float32
+    sums: Tensor  # [K, 3, 4] float64, zero
+
+
+@dataclass
+class ExposureStep(Launch):
+    """One step of Adam for the photos of a batch, in place; then the mean of all offsets is zero."""
+
+    sums: Tensor  # [K, 3, 4] float64
+    views: list[int]  # [K] layout.ViewRow
+    grid: GridOrigin
+    exposures: Exposures
+    overflow: Tensor | None  # [1] int32; if not 0, the launch does nothing
+    rate: float
+    beta1: float
+    beta2: float
+    eps: float
+    pull: float
 
 
 @dataclass
