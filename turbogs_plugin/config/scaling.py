@@ -69,6 +69,7 @@ def with_batch_for(config: Config, processes: int) -> Config:
         rates = section.get("learning_rates")
         if isinstance(rates, dict) and "batch_scale" in rates:
             rates["batch_scale"] *= processes**RATE_EXPONENT
+            rates["written_for"] = rates.get("written_for", 0) // processes  # a larger batch takes fewer iterations
     mapping["train"]["batch_for"] = processes
     return resolve(mapping)
 

@@ -43,6 +43,9 @@ LONGEST = 30_000
 """Most iterations of `auto`, 3DGS's own length: 60 epochs of 500 training views. More would take minutes or hours that
 nobody has asked for; a time budget asks for them. Divided by the times that an iteration has the pixels of one
 process."""
+MANY_VIEWS = 100
+"""Training views from which on `train.epochs` grows, with the root of their number: the more photos, the later does
+training overfit."""
 LARGEST_BATCH = 2
 """Most times the batch of one process. Twice costs no error; four times costs caliterra .25 to .73 dB."""
 SHORTEST_SHARE = 0.4
@@ -147,16 +150,17 @@ def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
     train, views = config.train, facts.train_views
     # A batch that is set is in the schedule already.
     factor = wanted_batch_for(facts, config)[0] if config.train.batch_for == AUTO else 1
-    wanted = train.epochs * views / (factor * images_per_iteration(config, views))
+    epochs = train.epochs * max(1.0, views / MANY_VIEWS) ** 0.5
+    wanted = epochs * views / (factor * images_per_iteration(config, views))
     fewest = SHORTEST_SHARE * WRITTEN_FOR / factor**RATE_EXPONENT
     longest = max(LONGEST / factor, fewest)
     given = min(max(wanted, fewest), longest)
-    reason = f"{train.epochs:g} epochs of {views} training views"
+    reason = f"{epochs:.3g} epochs of {views} training views"
     reason += f", {factor} times the pixels an iteration" if factor > 1 else ""
     if wanted < fewest:
         reason += f" take fewer than {fewest:.0f}, the least"
     if wanted > longest:
-        looks = train.epochs * longest / wanted
+        looks = epochs * longest / wanted
         reason += f" take {wanted:.0f}; at most {longest:.0f}, where a pixel is sampled {looks:.1f} times"
     return math.ceil(given / 100) * 100, reason
 
