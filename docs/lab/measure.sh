@@ -30,16 +30,15 @@ wall() { # VARIANT CAPTURE REPEATS SETTING ...
 studies="sizes paper parts departures density_departures bounds cameras paper_parts"
 for study in $studies; do ablate "$study" 0 1 2 3 4; done
 ablate baselines 0
-small=(schedule.pixel_budget=0.5 train.epochs=28 raster.transmittance_min=1e-3) # configs/turbogs-small.yaml
 structure=(density.absgrad_threshold=4.5e-4 pixel_sampler.unit=tile loss.type=sparse_ssim loss.ssim_weight=0.4)
 for capture in "$@"; do
     wall turbogs "$capture" 3
     wall ssim "$capture" 1 "${structure[@]}" train.dropout=auto # configs/turbogs-ssim.yaml
 done
-wall cap-67k "$1" 1 "${small[@]}" density.max_gaussians=67000
-wall cap-94k "$1" 1 "${small[@]}" density.max_gaussians=94000
-wall cap-157k "$2" 1 "${small[@]}" density.max_gaussians=157000
-wall cap-57k "$3" 1 "${small[@]}" density.max_gaussians=57000
+wall cap-67k "$1" 1 density.max_gaussians=67000
+wall cap-94k "$1" 1 density.max_gaussians=94000
+wall cap-157k "$2" 1 density.max_gaussians=157000
+wall cap-57k "$3" 1 density.max_gaussians=57000
 
 for study in $studies baselines; do cp "$out/$study/results.json" "docs/lab/$study/"; done
 python - "$out" <<'PYTHON'

@@ -61,6 +61,12 @@ def test_another_type_starts_its_section_afresh():
     assert same == {"schedule": {"alpha": 2.0, "type": "sinusoidal"}}
 
 
+def test_another_type_of_optimizer_keeps_the_learning_rates():
+    config = load_config("turbogs", ["optimizer.type=sparse_adam", "optimizer.learning_rates.quats=2e-3"])
+    rates = load_config("turbogs").optimizer["learning_rates"]
+    assert config.optimizer["learning_rates"] == {**rates, "quats": 2e-3} != rates
+
+
 def test_nested_dataclasses_of_a_strategy():
     config = load_config("turbogs", ["optimizer.learning_rates.batch_scale=1"])
     assert config.optimizer["learning_rates"]["batch_scale"] == 1.0

@@ -30,6 +30,16 @@ def test_rates_at_start_middle_and_end():
     assert LearningRates(means=0, means_final=0).at(STEP).means == 0
 
 
+@pytest.mark.parametrize(("total", "gain"), [(5000, 1.0), (20_000, 0.5), (1, 1.75)])
+def test_first_rates_fall_with_the_length_of_a_run_and_last_ones_and_the_means_do_not(total, gain):
+    plain, rates = (LearningRates(final_factor=0.25, written_for=written_for) for written_for in (0, 5000))
+    for fraction, factor in ((0.0, gain), (0.5, gain**0.5), (1.0, 1.0)):
+        step = Step(round(fraction * total), total, total)
+        factor = factor if total > 1 or fraction != 0.5 else gain
+        assert rates.at(step).sh0 == pytest.approx(factor * plain.at(step).sh0)
+        assert rates.at(step).means == plain.at(step).means
+
+
 def test_equals_torch_adam():
     gaussians = make_gaussians(7)
     rates = LearningRates(batch_scale=1.0)

@@ -165,7 +165,8 @@ def resolve_complete(mapping: Mapping[str, Any], where: str, decided: bool = Fal
 
 
 def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """`mapping` with ``section.key=value`` on top; a new ``section.type=name`` starts that section afresh."""
+    """`mapping` with ``section.key=value`` on top; a new ``section.type=name`` starts that section afresh,
+    but for its learning rates."""
     result = dict(mapping)
     for override in sorted(overrides, key=lambda text: ".type=" not in text):  # types first, the rest in order
         path, separator, text = override.partition("=")
@@ -202,14 +203,16 @@ def named_beside(name: str, file: str) -> str:
 
 
 def _merge(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`over` on top of `under`, mapping by mapping. Options of another type do not carry over."""
+    """`over` on top of `under`, mapping by mapping. Another type of a section keeps its learning rates alone."""
     result = dict(under)
     for key, value in over.items():
         below = result.get(key)
         if not (isinstance(below, Mapping) and isinstance(value, Mapping)):
             result[key] = value
         elif key in KINDS and "type" in value and value["type"] != below.get("type", default_type(key)):
-            result[key] = dict(value)
+            takes_rates = "learning_rates" in get_type_hints(strategy_class(key, str(value["type"])))
+            kept = {name: rates for name, rates in below.items() if name == "learning_rates" and takes_rates}
+            result[key] = _merge(kept, value)
         else:
             result[key] = _merge(below, value)
     return result
