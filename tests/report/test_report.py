@@ -101,9 +101,12 @@ def test_tables():
 def test_no_more_strips_than_the_bound(tmp_path, monkeypatch, strips):
     monkeypatch.setattr("turbogs_plugin.report.run_report.STRIPS", strips)
     config = tiny_config(tiny_capture(tmp_path), "train.iterations=1", "scene.test_every=4")
+    monkeypatch.setattr("turbogs_plugin.report.run_report.doubted", lambda errors: errors == errors.max())
     folder = run.train(config, tmp_path / "run", write_report).folder
-    assert len(list((folder.path / "report").glob("test-*.jpg"))) == strips
-    assert f"{strips} of 2 are shown" in folder.report.read_text()
+    page, pictures = folder.report.read_text(), sorted(path.name for path in (folder.path / "report").glob("*.jpg"))
+    assert len(list((folder.path / "report").glob("test-*.jpg"))) == strips == len(pictures) - strips
+    assert f"{strips} of 2 are shown" in page
+    assert ("## Doubted photos" in page) == bool(strips) and all(f"(report/{name})" in page for name in pictures)
 
 
 def test_a_depth_picture_is_bright_where_near_and_black_where_nothing_is():

@@ -6,7 +6,7 @@ import torch
 from helpers.sampling_cases import successive
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.strategies.view_sampling import GeometryAwareViewSampler, RandomViewSampler
+from turbogs_plugin.strategies.view_sampling import GeometryAwareViewSampler, RandomViewSampler, doubted
 from turbogs_plugin.types import Cameras, Step
 
 SAMPLERS = [GeometryAwareViewSampler, RandomViewSampler]
@@ -145,3 +145,23 @@ def test_identical_cameras_are_all_drawn(extent):
 def test_an_extent_that_is_no_number_is_named():
     with pytest.raises(InputError, match="scene_extent"):
         GeometryAwareViewSampler().setup(orbit(3), float("nan"))
+
+
+def test_a_photo_that_the_model_does_not_explain_comes_in_one_of_five_rounds():
+    sampler, errors = ready(RandomViewSampler(), orbit(20)), 1.0 + 0.01 * np.arange(20)
+    errors[[3, 11]] = 9.0
+    assert np.flatnonzero(doubted(errors)).tolist() == [3, 11]
+    counts = np.zeros(20)
+    for iteration in range(200, 900):
+        counts[list(sampler.select(18, errors, step(iteration)))] += 1
+    assert (counts[[3, 11]] < 0.35 * 700).all() and (counts[[3, 11]] > 0.1 * 700).all()
+    assert np.delete(counts, [3, 11]).min() > 0.85 * 700
+    early = [view for _ in range(20) for view in sampler.select(20, errors, step(10))]
+    assert early.count(3) == 20, "before a fifth of densification no photo is doubted"
+
+
+@pytest.mark.parametrize(
+    "errors", [np.ones(6), np.zeros(6), np.array([1, 1.1, 0.9, 1.2, 1, 2.4]), np.geomspace(1, 20, 30)]
+)
+def test_photos_that_are_harder_than_others_are_not_doubted(errors):
+    assert not doubted(errors).any()

@@ -6,14 +6,21 @@ import platform
 import shlex
 from pathlib import Path
 
+import numpy as np
+
 from turbogs_plugin.config.sections import STRIPS
 from turbogs_plugin.files import read_text, write_text_atomically
 from turbogs_plugin.report.evaluation import load_lpips
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip
 from turbogs_plugin.report.provenance import hardware, software
 from turbogs_plugin.report.tables import ERRORS, error_columns, errors, history_rows, table, views_table
+from turbogs_plugin.strategies.view_sampling import doubted
 from turbogs_plugin.train.metrics import Metrics, evaluate, render_view
 from turbogs_plugin.train.session import RunSession
+
+DOUBTED = """
+The model does not explain these training photos as it does the others: look for a wrong pose, a passer-by, blur or
+another light. Training took each in one of five rounds."""
 
 
 def write_report(run: RunSession) -> Path:
@@ -32,14 +39,19 @@ def write_report(run: RunSession) -> Path:
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)
     strips = min(len(run.test), STRIPS)
-    for view_id in range(strips):
-        image = render_view(trainer.gaussians, run.test, view_id, look)
-        photo = run.test.photos.image(view_id, look.background)
-        pixels = strip(photo, image, run.test.mask(view_id)).cpu().numpy()
-        save_image(pictures / f"test-{view_id:03d}.jpg", pixels)
+    view_errors = trainer.maps.view_means()
+    worst = [int(view) for view in np.argsort(-view_errors)[:STRIPS] if doubted(view_errors)[view]]
+    shown = [("test", run.test, look, range(strips))]
+    shown += [("doubted", trainer.views, trainer.look(trainer.views.names), worst)] if worst else []
+    for kind, views, seen, view_ids in shown:
+        for view_id in view_ids:
+            image = render_view(trainer.gaussians, views, view_id, seen)
+            pixels = strip(views.photos.image(view_id, seen.background), image, views.mask(view_id)).cpu().numpy()
+            save_image(pictures / f"{kind}-{view_id:03d}.jpg", pixels)
     _plot(run, pictures)
     run.clock.mark("pictures and plots")
-    write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, strips))
+    times = {view: view_errors[view] / np.median(view_errors) for view in worst}
+    write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, strips, times))
     run.clock.mark("report")
     return run.folder.report
 
@@ -53,13 +65,14 @@ def _plot(run: RunSession, pictures: Path) -> None:
         plot_against_seconds(pictures / f"{name}.png", seconds, values, label, run.scene.name)
 
 
-def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> str:
+def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int, doubts: dict[int, float]) -> str:
     """The text of the page.
 
     Args:
         metrics: of the final model.
         lpips_reason: why LPIPS was not computed; empty where it was.
         shown: test views with a picture.
+        doubts: photo that training doubted -> times the median that its error is.
     """
     last, plan = run.history[-1], read_text(run.folder.plan) or "The run's folder holds no plan."
     config = run.trainer.config
@@ -94,6 +107,12 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int) -> s
         f"{view.name}: {view.psnr:.2f} dB\n\n![{view.name}](report/test-{view_id:03d}.jpg)"
         for view_id, view in enumerate(metrics.views[:shown])
     )
+    doubted_photos = "".join(
+        f"\n{run.trainer.views.names[view]}: {ratio:.1f} times the median error\n\n"
+        f"![doubted](report/doubted-{view:03d}.jpg)\n"
+        for view, ratio in doubts.items()
+    )
+    doubted_photos = doubted_photos and f"\n## Doubted photos\n{DOUBTED}\n{doubted_photos}"
     folder = shlex.quote(str(run.folder.path))
     exported = "[model.html](model.html)" if (run.folder.path / "model.html").is_file() else "`model.html`"
     return f"""# {run.scene.name}
@@ -124,7 +143,7 @@ From left to right: photo, render, error (mean absolute difference over RGB: bla
 {strips}
 
 {views_table(metrics)}
-
+{doubted_photos}
 ## Plan
 
 ```text
