@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.models import load_ply
 
 from turbogs_plugin.commands.options import GivenOptions
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.export import renders
-from turbogs_plugin.export.model_export import contributions, pruned
-from turbogs_plugin.model.formats import FORMATS
+from turbogs_plugin.export.model_export import EXPORTS, contributions, pruned
+from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.types import SH_C0, WHITE
 
 
@@ -24,15 +23,39 @@ def refused(result: tuple[int, str, str], *words: object) -> None:
     assert all(str(word) in err for word in words), err
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", EXPORTS)
 def test_an_export_says_bytes_and_what_was_lost(turbogs, finished, tmp_path, name):
-    file = tmp_path / f"m.{name}"
+    file = tmp_path / f"m.{EXPORTS[name].suffix}"
     code, out, err = turbogs("export", finished, "--format", name, "--out", file)
     assert code == 0, err
     held = sum(4 * value.numel() for _, value in load_ply(finished / "model.ply").items())
     assert f"{held:,} bytes in float32 -> {file.stat().st_size:,} bytes in the file" in out
     before, after = map(float, re.search(r"PSNR   ([\d.]+) -> ([\d.]+) dB on 1 of 1 test views", out).groups())
-    assert abs(before - after) < (0.005 if name in ("ply", "pt") else 1)
+    assert abs(before - after) < (1 if name in ("spz", "spz2") else 0.005)
+    assert ("version" in out) == (EXPORTS[name].suffix == "spz")
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_a_capture_far_from_its_origin_is_exported_about_another(turbogs, finished, capture, tmp_path, name):
+    """UTM metres; the file is found again beside its capture."""
+    moved, file = tmp_path / "moved", tmp_path / f"m.{EXPORTS[name].suffix}"
+    shutil.copytree(capture, moved)
+    model = load_pycolmap().Reconstruction(moved / "sparse/0")
+    model.transform(load_pycolmap().Sim3d(1.0, load_pycolmap().Rotation3d(), np.array([5e5, 5.4e6, 300.0])))
+    model.write(moved / "sparse/0")
+    shutil.copytree(finished, tmp_path / "run")
+    config = tmp_path / "run/config.yaml"
+    config.write_text(config.read_text().replace(str(capture), str(moved)))
+    given = ("--scene", moved, "--format", name, "--out", file)
+    far = tmp_path / "far.ply"
+    frame = load_scene(moved).frame
+    save_ply(load_model(finished, torch.device("cpu")).gaussians, far, frame)
+    code, out, err = turbogs("export", far, *given)
+    assert code == 0 and re.search(r"about the local origin 500\d\d\d 5\d{6} \d+", out), (out, err)
+    before, after = map(float, re.search(r"PSNR   ([\d.]+) -> ([\d.]+) dB", out).groups())
+    assert abs(before - after) < (1 if name in ("spz", "spz2") else 0.01)
+    if name in FORMATS:
+        assert (load_given(file, load_scene(moved)).means - load_ply(far, frame).means).abs().max() < 1e-3
 
 
 def test_a_given_model_has_the_background_of_its_photos(capture):

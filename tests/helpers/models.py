@@ -1,13 +1,7 @@
 """Models that tests of several rooms share."""
 
-from pathlib import Path
-
-import numpy as np
 import torch
 
-from turbogs_plugin.model.ply import read_ply
-from turbogs_plugin.model.similarity import Similarity, placed
-from turbogs_plugin.scene import Frame
 from turbogs_plugin.types import Gaussians
 
 
@@ -18,8 +12,3 @@ def random_gaussians(count: int = 40, sh_degree: int = 3, seed: int = 0, dtype=t
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (bands, 3)}
     values = {name: torch.randn(count, *shape, generator=generator, dtype=dtype) for name, shape in shapes.items()}
     return Gaussians(**values)
-
-
-def load_ply(path: Path, frame: Frame | None = None) -> Gaussians:
-    """The model of a file as training takes it, in a frame of its coordinates."""
-    return placed(read_ply(path), Similarity.into(frame or Frame(np.zeros(3), 1.0)), path)

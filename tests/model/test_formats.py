@@ -1,7 +1,9 @@
 """Every format is read back."""
 
 import gzip
+import itertools
 import struct
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from helpers.models import random_gaussians
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.similarity import Similarity
+from turbogs_plugin.model.spz import save_spz
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.types import SH_C0, Gaussians
 
@@ -47,7 +50,8 @@ STEPS = {
 def test_a_format_reads_back_within_its_steps(tmp_path, name):
     made, frame = gaussians(), Frame(np.array([3.0, -2.0, 5.0]), 2.5)
     file = tmp_path / f"m.{name}"
-    FORMATS[name].write(made, file, frame, 7)
+    FORMATS[name].write(made, file, frame, 7, True)
+    assert FORMATS[name].is_antialiased(file) == (name != "pt")
     read = matched(made, Similarity.into(frame).apply(FORMATS[name].read(file)).map(torch.Tensor.float))
     mean, rotation, scale, opacity, color, harmonic = STEPS[name]
     extent = float(made.means.abs().max())
@@ -71,7 +75,7 @@ def test_spz_by_hand(tmp_path):
         sh0=torch.tensor([[[0.0, 1.0, -20.0]]]),
         shN=torch.zeros(1, 3, 3),
     )
-    FORMATS["spz"].write(one, tmp_path / "m", Frame(np.zeros(3), 1.0), 0)
+    FORMATS["spz"].write(one, tmp_path / "m", Frame(np.zeros(3), 1.0), 0, False)
     content = gzip.decompress((tmp_path / "m").read_bytes())
     magic, version, count, degree, bits, flags, zero = struct.unpack_from("<IIIBBBB", content)
     assert (magic, version, count, degree, flags, zero) == (0x5053474E, 3, 1, 1, 0, 0)
@@ -87,24 +91,73 @@ def test_spz_by_hand(tmp_path):
 @pytest.mark.parametrize("name", ["pt", "spz"])
 def test_a_capture_far_from_its_origin_is_refused_in_single_precision(tmp_path, name):
     with pytest.raises(InputError, match="--format ply"):
-        FORMATS[name].write(gaussians(), tmp_path / "m", Frame(np.array([5e8, 0.0, 0.0]), 1.0), 0)
+        FORMATS[name].write(gaussians(), tmp_path / "m", Frame(np.array([5e8, 0.0, 0.0]), 1.0), 0, False)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("damage", ["cut", "longer", "other"])
 def test_a_damaged_spz_is_refused(tmp_path, damage):
     file = tmp_path / "m"
-    FORMATS["spz"].write(gaussians(), file, Frame(np.zeros(3), 1.0), 0)
+    FORMATS["spz"].write(gaussians(), file, Frame(np.zeros(3), 1.0), 0, False)
     content = file.read_bytes()
     file.write_bytes({"cut": content[:-5], "longer": content[:40] + b"abc" + content[40:], "other": b"ply\nno"}[damage])
     with pytest.raises(InputError, match=file.name):
         FORMATS["spz"].read(file)
 
 
+def as_version(number: int, content: bytes, flags: int = 0, tail: bytes = b"") -> bytes:
+    """A .spz of version 3 without harmonics, of rotations that are the identity, as one of another version."""
+    _, _, count, _, bits, _, _ = struct.unpack_from("<IIIBBBB", content)
+    ends = 16 + count * np.cumsum([0, 9, 1, 3, 3, 4])
+    parts = [content[start:end] for start, end in itertools.pairwise(ends)]
+    if number < 3:
+        parts[4] = bytes([128, 127, 128]) * count
+    if number == 1:
+        raw = np.frombuffer(parts[0], np.uint8).reshape(-1, 3)
+        wide = np.c_[np.zeros(len(raw), np.uint8), raw].copy().view("<i4")[:, 0] >> 8
+        parts[0] = (wide / 2.0**bits).astype("<f2").tobytes()
+    if number < 4:
+        return gzip.compress(
+            struct.pack("<IIIBBBB", 0x5053474E, number, count, 0, bits, flags, 0) + b"".join(parts) + tail
+        )
+    zstandard = pytest.importorskip("zstandard")
+    packed = [zstandard.ZstdCompressor().compress(part) for part in parts]
+    table = b"".join(struct.pack("<QQ", len(each), len(part)) for each, part in zip(packed, parts, strict=True))
+    header = struct.pack("<IIIBBBBI12x", 0x5053474E, 4, count, 0, bits, flags, 5, 32 + len(tail))
+    return header + tail + table + b"".join(packed)
+
+
+@pytest.mark.parametrize(
+    ("number", "flags", "tail"), [(1, 0, b""), (2, 1, b""), (3, 2, b"12345678"), (4, 1, b""), (4, 2, b"12345678")]
+)
+def test_every_version_of_spz_is_read(tmp_path, number, flags, tail):
+    made, file = gaussians(), tmp_path / "m"
+    made.quats[:], made.shN = torch.tensor([1.0, 0.0, 0.0, 0.0]), made.shN[:, :0]
+    FORMATS["spz"].write(made, file, Frame(np.zeros(3), 1.0), 0, False)
+    expected = FORMATS["spz"].read(file)
+    file.write_bytes(as_version(number, gzip.decompress(file.read_bytes()), flags, tail))
+    with pytest.warns(UserWarning, match="version 1") if number == 1 else nullcontext():
+        read = FORMATS["spz"].read(file)
+    for (name, value), (_, other) in zip(read.items(), expected.items(), strict=True):
+        assert float((value - other).abs().max() if len(value[0:1].flatten()) else 0) < 0.01, name
+    assert FORMATS["spz"].is_antialiased(file) == (flags == 1)
+    file.write_bytes(file.read_bytes()[: -file.stat().st_size // 3])
+    with pytest.raises(InputError, match=f"version {number}"):
+        FORMATS["spz"].read(file)
+
+
+def test_the_older_spz_is_read_back(tmp_path):
+    made, file = gaussians(), tmp_path / "m"
+    save_spz(made, file, Frame(np.zeros(3), 1.0), version=2)
+    assert gzip.decompress(file.read_bytes())[4] == 2
+    turned = (rotations(FORMATS["spz"].read(file).quats) * rotations(made.quats)).sum(dim=1).abs()
+    assert float(turned.min()) > 0.99
+
+
 def test_spz_turns_rotations_and_harmonics_to_its_axes(tmp_path):
     quats, harmonics = torch.tensor([[0.8, 0.2, 0.4, 0.4]]), torch.full((1, 3, 3), 0.5)
     one = Gaussians(torch.zeros(1, 3), quats, torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3), harmonics)
-    FORMATS["spz"].write(one, tmp_path / "m", Frame(np.zeros(3), 1.0), 0)
+    FORMATS["spz"].write(one, tmp_path / "m", Frame(np.zeros(3), 1.0), 0, False)
     body, minus = gzip.decompress((tmp_path / "m").read_bytes())[16:], 1 << 9
     assert int.from_bytes(body[16:20], "little") == 3 << 30 | 145 << 20 | (289 | minus) << 10 | (289 | minus)
     assert list(body[20:]) == [64] * 6 + [192] * 3  # y and z change their sign, x does not

@@ -1,13 +1,15 @@
 """Models to and from .ply."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from gsplat import export_splats
-from helpers.models import load_ply, random_gaussians
+from helpers.models import random_gaussians
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.ply import save_ply
+from turbogs_plugin.model.ply import is_antialiased_ply, load_ply, save_ply
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.scene.ply import read_vertices
 
@@ -26,10 +28,11 @@ def test_ply_round_trip_is_exact(tmp_path, sh_degree):
 def test_ply_has_the_properties_of_3dgs_in_its_order(tmp_path):
     save_ply(random_gaussians(), tmp_path / "model.ply")
     header = (tmp_path / "model.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
-    assert header[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 40"]
+    mode = "comment SplatRenderMode: default"
+    assert header[:4] == ["ply", "format binary_little_endian 1.0", mode, "element vertex 40"]
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45))]
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    assert header[3:] == [f"property float {name}" for name in names]
+    assert header[4:] == [f"property float {name}" for name in names]
 
 
 def test_ply_agrees_with_gsplat(tmp_path):
@@ -98,6 +101,59 @@ def test_load_leaves_out_rows_that_are_not_finite_and_refuses_a_model_without_an
         load_ply(tmp_path / "model.ply")
     with pytest.raises(InputError, match=r"cannot read .*absent\.ply"):
         load_ply(tmp_path / "absent.ply")
+
+
+def written(path: Path, columns: dict[str, np.ndarray], comment: str = "") -> Path:
+    """A .ply of float properties."""
+    head = ["ply", "format binary_little_endian 1.0", *([comment] if comment else [])]
+    head += [f"element vertex {len(columns['x'])}", *(f"property float {name}" for name in columns), "end_header\n"]
+    path.write_bytes("\n".join(head).encode() + np.stack(list(columns.values()), axis=1).astype("<f4").tobytes())
+    return path
+
+
+@pytest.fixture
+def columns(tmp_path) -> dict[str, np.ndarray]:
+    save_ply(random_gaussians(20), tmp_path / "own.ply")
+    return {name: values.copy() for name, values in read_vertices(tmp_path / "own.ply").items()}
+
+
+def test_infinite_opacities_and_flat_gaussians_stay(tmp_path, columns):
+    columns["opacity"][:2], columns["scale_1"][2] = (np.inf, -np.inf), -np.inf
+    with pytest.warns(UserWarning, match="1 Gaussians are flat"):
+        read = load_ply(written(tmp_path / "a.ply", columns))
+    shares = torch.sigmoid(read.opacities)
+    assert len(read) == 20 and float(shares[0]) == 1.0 and float(shares[1]) < 1e-8 and float(read.scales[2, 1]) < -15
+
+
+def test_a_3d_filter_is_fused(tmp_path, columns):
+    """Against covariances and integrals by hand."""
+    before = load_ply(written(tmp_path / "a.ply", columns))
+    read = load_ply(written(tmp_path / "b.ply", columns | {"filter_3D": np.full(20, 0.5)}))
+    variances = (2 * before.scales).exp()
+    torch.testing.assert_close((2 * read.scales).exp(), variances + 0.25)
+    shares = torch.sigmoid(before.opacities) * (variances.prod(dim=1) / (variances + 0.25).prod(dim=1)).sqrt()
+    torch.testing.assert_close(torch.sigmoid(read.opacities), shares)
+
+
+@pytest.mark.parametrize(
+    ("comment", "antialiased"),
+    [
+        ("comment SplatRenderMode: mip", True),
+        ("comment splatrendermode:mip\r", True),
+        ("comment antialiased 1", True),
+        ("comment antialiased 0", False),
+        ("comment SplatRenderMode: default", False),
+        ("", False),
+    ],
+)
+def test_a_comment_says_that_a_model_is_antialiased(tmp_path, columns, comment, antialiased):
+    assert is_antialiased_ply(written(tmp_path / "a.ply", columns, comment)) is antialiased
+
+
+def test_a_model_of_2dgs_is_named(tmp_path, columns):
+    del columns["scale_2"]
+    with pytest.raises(InputError, match="lacks scale_2: it is a model of 2D Gaussian Splatting"):
+        load_ply(written(tmp_path / "a.ply", columns))
 
 
 def test_a_mesh_is_no_model(tmp_path):

@@ -1,5 +1,6 @@
 """Models trained anywhere: a start for training, and evaluated, rendered and exported with a capture named."""
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -11,17 +12,21 @@ from gsplat import export_splats
 from helpers.framework_runs import tiny_config
 from helpers.models import random_gaussians
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.gsplat_world import gsplat_worlds
-from turbogs_plugin.model.ply import read_ply
-from turbogs_plugin.train import run
+from turbogs_plugin.model.placement import TRANSFORMS, TURNS
+from turbogs_plugin.model.ply import read_ply, save_ply
+from turbogs_plugin.model.similarity import Similarity
+from turbogs_plugin.train import run, saved_model
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.saved_model import load_given, load_model
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Gaussians
+from turbogs_plugin.viewer.show import open_state
 
 CPU = torch.device("cpu")
 LENGTH = ("train.iterations=18", "train.refine_until=9", "train.evaluate_at=[]")
@@ -128,11 +133,48 @@ def test_the_world_is_said_by_a_setting_in_training_and_evaluation(turbogs, fini
     assert_alike(load_given(checkpoint, load_scene(capture), "gsplat"), trained)
 
 
+@pytest.mark.parametrize("turn", TURNS)
+def test_nerfstudios_file_beside_a_model_brings_it_back(finished, capture, tmp_path, turn):
+    """A model of COLMAP's own coordinates, of those of `ns-process-data`, or not of nerfstudio at all."""
+    scene, model = load_scene(capture), read_ply(finished / "model.ply")
+    change = Similarity(Rotation.from_euler("xyz", (0.4, -1.1, 0.2)).as_matrix(), 0.3, np.array([0.1, -0.2, 0.3]))
+    values = {"transform": np.c_[change.rotation, change.translation / 0.3].tolist(), "scale": 0.3}
+    (tmp_path / TRANSFORMS).write_text(json.dumps(values))
+    theirs = Similarity(turn, 1.0, np.zeros(3)).inverse()
+    for given in (change.after(theirs).apply(model), model):
+        loaded = load_given(save_splats(tmp_path / "a.pt", given), scene)
+        torch.testing.assert_close(loaded.means, load_model(finished, CPU).gaussians.means, rtol=1e-3, atol=1e-3)
+    (tmp_path / TRANSFORMS).write_text(json.dumps(values | {"scale": 0}))
+    with pytest.raises(InputError, match=TRANSFORMS):
+        load_given(tmp_path / "a.pt", scene)
+
+
+def test_a_model_in_other_coordinates_is_said_not_to_fit(finished, capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(saved_model, "FEWEST_POINTS", 50)
+    monkeypatch.setattr(saved_model, "FARTHEST_POINTS", 0.3)  # of a tiny capture, whose points lie far apart
+    change = Similarity(Rotation.from_euler("x", 0.7).as_matrix(), 0.31, np.array([0.1, -0.2, 0.3]))
+    file = save_splats(tmp_path / "a.pt", change.apply(read_ply(finished / "model.ply")))
+    with pytest.warns(UserWarning, match="does not fit the points"):
+        load_given(file, load_scene(capture))
+
+
+def test_the_newest_model_in_folders_of_other_trainers(finished, capture, tmp_path, turbogs):
+    for folder, name in (("inria/point_cloud/iteration_{}", "point_cloud.ply"), ("gsplat/ckpts", "ckpt_{}_rank0.pt")):
+        for number, count in ((7000, 5), (30000, 9)):
+            file = tmp_path / folder.format(number) / name.format(number)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            model = read_ply(finished / "model.ply").map(lambda value, count=count: value[:count])
+            save_splats(file, model) if file.suffix == ".pt" else save_ply(model.map(torch.Tensor.float), file)
+        found = tmp_path / folder.partition("/")[0]
+        assert len(load_given(found, load_scene(capture))) == 9
+        assert open_state(found, CPU).gaussians.means.shape[0] == 9
+
+
 def test_rows_that_are_not_finite_are_left_out_and_counted_once(finished, capture, tmp_path):
     model = read_ply(finished / "model.ply")
     kept = torch.ones(len(model), dtype=torch.bool)
     kept[[2, 5, 9]] = False
-    model.means[2, 1], model.opacities[5], model.shN[9, 0, 0] = torch.nan, torch.inf, -torch.inf
+    model.means[2, 1], model.opacities[5], model.shN[9, 0, 0] = torch.nan, torch.nan, -torch.inf
     file = save_splats(tmp_path / "ckpt.pt", model)
     with pytest.warns(UserWarning) as warned:
         loaded = load_given(file, load_scene(capture))
@@ -203,6 +245,10 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         "other keys": (saved("weights.pt", {"conv1": torch.zeros(3), "bias": torch.zeros(1)}), "bias, conv1"),
         "code": (saved("code.pt", {"splats": Path("x")}), "more than plain tensors"),
         "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
+        **{
+            kind: (written(f"m.{kind}", b"x"), words)
+            for kind, words in (("sog", "splat-transform"), ("ckpt", "ns-export"), ("pth", "point_cloud.ply"))
+        },
         "not a spz": (written("text.spz", b"text"), "cannot read"),
     }
 

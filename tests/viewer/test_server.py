@@ -174,7 +174,7 @@ def test_a_model_from_a_file_stands_before_the_camera(state, tmp_path):
     far = state.gaussians.map(lambda value: value.clone())
     far.means = far.means * 50.0 + torch.tensor([1000.0, -2000.0, 500.0])
     file = tmp_path / "model.ply"
-    FORMATS["ply"].write(far, file, Frame(np.zeros(3), 1.0), 0)
+    FORMATS["ply"].write(far, file, Frame(np.zeros(3), 1.0), 0, False)
     found = open_state(file, torch.device("cpu"))
     distances = found.gaussians.means.norm(dim=1)
     assert 0.45 < float((distances <= 1.01).float().mean()) < 0.55

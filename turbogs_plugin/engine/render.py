@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine import engine_of
+from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
 from turbogs_plugin.engine.render_pass import Rendered, RenderOptions
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
@@ -48,10 +49,22 @@ class RenderedImage:
 
 
 @torch.no_grad()
-def render_image(gaussians: Gaussians, cameras: Cameras, view_id: int = 0, **options: Any) -> RenderedImage:
-    """Render every pixel of one of the cameras; `options` are the fields of `RenderOptions`."""
-    samples = dense_samples(cameras, [view_id])
-    rendered = rasterize(gaussians, cameras.select([view_id]), samples, **options)
+def render_image(
+    gaussians: Gaussians, cameras: Cameras, view_id: int = 0, antialiased: bool = False, **options: Any
+) -> RenderedImage:
+    """Render every pixel of one of the cameras.
+
+    Args:
+        antialiased: as gsplat's ``rasterize_mode="antialiased"``: less opaque, the more `eps2d` adds to a splat.
+        options: the fields of `RenderOptions`.
+    """
+    samples, camera = dense_samples(cameras, [view_id]), cameras.select([view_id])
+    if antialiased:
+        settings = RenderOptions(**options).settings
+        rows = drawable_rows(gaussians, camera, settings)
+        shares = rows.scatter(project_rows(rows, rows.take(gaussians), camera, 0, settings).shares)[0]
+        gaussians = replace(gaussians, opacities=torch.logit(torch.sigmoid(gaussians.opacities) * shares))
+    rendered = rasterize(gaussians, camera, samples, **options)
     width, height = cameras.sizes[view_id].tolist()
     places = samples.pixel_ids.long()
 

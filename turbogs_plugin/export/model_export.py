@@ -1,11 +1,18 @@
-"""Models written for other programs: in every format, or as a page to turn them on (`turbogs export`)."""
+"""Models written for other programs: in every format, or as a page to turn them on (`turbogs export`).
+
+A file of single precision would round the places of a capture that lies far from its origin (UTM metres), so it is
+about a `local_origin`, which is said; the run's own ``model.ply`` has doubles.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,9 +22,12 @@ from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.html_page import html_page, page_gaussians
+from turbogs_plugin.export.scene_files import save_glb, save_usda
 from turbogs_plugin.files import require_new_file, write_text_atomically
 from turbogs_plugin.model.formats import FORMATS
-from turbogs_plugin.model.similarity import Similarity
+from turbogs_plugin.model.similarity import Similarity, local_origin
+from turbogs_plugin.model.spz import VERSION, read_spz, save_spz
+from turbogs_plugin.scene import Frame
 from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.inputs import resolve_device
@@ -25,6 +35,24 @@ from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.saved_model import load_with_capture
 from turbogs_plugin.types import Cameras, Gaussians
 
+
+class Export(NamedTuple):
+    """A format of exported files: its suffix, how it is written (as `Format.write`) and read again, None where every
+    number is as it was; and whether the file can say that the model is antialiased."""
+
+    suffix: str
+    write: Callable[[Gaussians, Path, Frame, int, bool], None]
+    read: Callable[[Path], Gaussians] | None = None
+    marked: bool = False
+
+
+EXPORTS = {
+    **{name: Export(name, each.write, each.read, name != "pt") for name, each in FORMATS.items()},
+    "spz2": Export("spz", partial(save_spz, version=2), read_spz, True),
+    "glb": Export("glb", lambda model, path, frame, step, mip: save_glb(model, path, frame)),
+    "usda": Export("usda", lambda model, path, frame, step, mip: save_usda(model, path, frame)),
+}
+"""Name, as on the command line -> the format."""
 PAGE = "html"
 """Name of the page with the model to turn, which no program reads back."""
 MOST_ON_PAGE = 800_000
@@ -40,7 +68,7 @@ def export_run(
 
     Args:
         path: folder of the run, or the file of a model.
-        file_format: one of `FORMATS`, or `PAGE`.
+        file_format: one of `EXPORTS`, or `PAGE`.
         out: new file; None: beside the model in the run's folder.
         max_gaussians: largest number of Gaussians to keep, those that add most to the training views; None: all.
         given: the capture of a model from a file, and how to render it; None: `path` is a run.
@@ -58,7 +86,7 @@ def export_run(
     file = out
     if file is None:
         assert model.folder is not None, "only a run is exported without --out"
-        file = model.folder.model.with_suffix(f".{file_format}")
+        file = model.folder.model.with_suffix(f".{_suffix(file_format)}")
     if is_page:
         max_gaussians = min(max_gaussians or MOST_ON_PAGE, MOST_ON_PAGE)
     kept, whole = model.gaussians, model.gaussians
@@ -72,8 +100,17 @@ def export_run(
         eps2d, usual = model.config.raster.eps2d, DEFAULT_SETTINGS.eps2d
         if eps2d != usual:
             notes += (f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}",)
-        FORMATS[file_format].write(kept, file, model.frame, model.iteration or 0)
-        written = Similarity.into(model.frame).apply(FORMATS[file_format].read(file)).map(torch.Tensor.float)
+        form, frame = EXPORTS[file_format], model.frame
+        origin = local_origin(frame) if out is not None or file_format != "ply" else np.zeros(3)
+        if origin.any():
+            frame = Frame(frame.center - origin, frame.scale)
+            notes += (f"about the local origin {' '.join(f'{value:.12g}' for value in origin)}",)
+        if form.suffix == "spz":
+            notes += (f"version {VERSION}; older viewers need --format spz2" if file_format == "spz" else "version 2",)
+        if model.antialiased and not form.marked:
+            notes += ("of antialiased training, which this file does not say",)
+        form.write(kept, file, frame, model.iteration or 0, model.antialiased)
+        written = kept if form.read is None else Similarity.into(frame).apply(form.read(file)).map(torch.Tensor.float)
     lost = f"not measured: {absent or 'the capture has no test views'}"
     caption = f"{len(written):,} Gaussians, one colour each"
     if scene is not None and len(scene.test):
@@ -97,19 +134,23 @@ def _require_options(
     path: Path, file_format: str, out: Path | None, max_gaussians: int | None, given: Config | None
 ) -> None:
     """Raise `InputError` where options do not fit each other, before anything is loaded."""
-    if file_format not in (*FORMATS, PAGE):
-        known = ", ".join((*FORMATS, PAGE))
+    if file_format not in (*EXPORTS, PAGE):
+        known = ", ".join((*EXPORTS, PAGE))
         raise InputError(f"--format {file_format}: there is no such format; choose one of {known}")
     if max_gaussians is not None and max_gaussians < 1:
         raise InputError(f"--max-gaussians {max_gaussians}: it must be at least 1")
     if out is not None:
         require_new_file(out, "--out")
-        if out.suffix.lower() != f".{file_format}":
-            raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in .{file_format}")
+        if out.suffix.lower() != f".{_suffix(file_format)}":
+            raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in .{_suffix(file_format)}")
     elif given is not None:
         raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
     elif max_gaussians is not None and file_format == "ply":
         raise InputError("--max-gaussians would replace the run's own model.ply: name a new file by --out")
+
+
+def _suffix(file_format: str) -> str:
+    return PAGE if file_format == PAGE else EXPORTS[file_format].suffix
 
 
 @torch.no_grad()

@@ -19,40 +19,8 @@ import numpy as np
 
 from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.scene.geometry import camera_centers
-from turbogs_plugin.types import SH_C0, Gaussians
 
 HALF_TURNS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
-POINTS_AT_MOST = 20_000
-"""Points of the reconstruction that a model is compared with."""
-COLOR_WEIGHT = 0.5
-"""Distance, in units of the world, that counts as much as a channel's whole range."""
-
-
-def out_of_gsplat_world(
-    gaussians: Gaussians, viewmats: np.ndarray, points: np.ndarray, colors: np.ndarray
-) -> Similarity | None:
-    """The change of a model from gsplat's normalised world to its capture's own coordinates; None where the cameras or
-    points determine no world.
-
-    Args:
-        gaussians: float64; rows may be not finite.
-        viewmats, points: as in `gsplat_worlds`.
-        colors: [M, 3] uint8 of the points.
-    """
-    from scipy.spatial import cKDTree
-
-    worlds = gsplat_worlds(viewmats, points)
-    rows = np.concatenate([gaussians.means.numpy(), COLOR_WEIGHT * (SH_C0 * gaussians.sh0[:, 0].numpy() + 0.5)], axis=1)
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    if not worlds or not len(rows):
-        return None
-    tree, every = cKDTree(rows), slice(None, None, -(-len(points) // POINTS_AT_MOST))
-    shades = COLOR_WEIGHT * colors[every] / 255.0
-    apart = []
-    for world in worlds:
-        places = world.scale * points[every] @ world.rotation.T + world.translation
-        apart.append(np.median(tree.query(np.concatenate([places, shades], axis=1))[0]))  # passes over lone points
-    return worlds[int(np.argmin(apart))].inverse()
 
 
 def gsplat_worlds(viewmats: np.ndarray, points: np.ndarray) -> list[Similarity]:

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.model.gsplat_file import BANDS
-from turbogs_plugin.model.similarity import in_capture, rounding
+from turbogs_plugin.model.similarity import Similarity, in_capture, placed, rounding
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.ply import read_vertices
 from turbogs_plugin.types import Gaussians
 
 POSITION_ERROR = 1e-6
 """Largest `rounding` of positions that are written as float."""
+HEADER_AT_MOST = 1 << 16
+"""Bytes of a file in which a comment is looked for."""
+ANTIALIASED = re.compile(rb"^comment\s+(splatrendermode:\s*mip|antialiased\W+(1|true))\b", re.MULTILINE | re.IGNORECASE)
+"""Brush's comment, which splat-transform writes, too, and Postshot's."""
 
 
-def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None) -> None:
+def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None, antialiased: bool = False) -> None:
     """Write a model as a .ply with the properties of the original 3DGS, normals (zero) included.
 
     All properties are float, as viewers expect. Only x, y and z are double, if the capture lies so far from the origin
@@ -31,6 +38,7 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
         gaussians: the model. Gaussians that are not finite are left out, with a warning that counts them.
         path: the file to write; its folder must exist.
         frame: if given, the model is written in the capture's own coordinates.
+        antialiased: how the model is drawn, which a comment says in Brush's words.
 
     Raises:
         InputError: there is nothing to write.
@@ -48,7 +56,8 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
     for name, value in rows.items():
         array = value.transpose(1, 2).numpy() if name == "shN" else value.numpy()
         table[name].reshape(array.shape)[...] = array
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    mode = f"comment SplatRenderMode: {'mip' if antialiased else 'default'}"
+    header = ["ply", "format binary_little_endian 1.0", mode, f"element vertex {len(table)}"]
     header += [f"property {kind} {name}" for parameter, kind in kinds.items() for name in groups[parameter]]
 
     def write(file: BinaryIO) -> None:
@@ -59,7 +68,8 @@ def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None)
 
 
 def read_ply(path: str | Path) -> Gaussians:
-    """Read a model from a .ply with the properties of 3DGS; others are ignored.
+    """Read a model from a .ply with the properties of 3DGS; others are ignored but the ``filter_3D`` of Mip-Splatting,
+    which is fused into scales and opacities.
 
     Returns:
         float64, on the CPU, in the file's own coordinates; rows may be not finite.
@@ -75,7 +85,13 @@ def read_ply(path: str | Path) -> Gaussians:
         raise InputError(f"{path} has {rest} properties f_rest_*: harmonics of degree 0 .. 3 have 0, 9, 24 or 45")
     groups = _property_groups(bands)
     del groups["normals"]  # not part of a model
-    if missing := [name for group in groups.values() for name in group if name not in vertices]:
+    missing = [name for group in groups.values() for name in group if name not in vertices]
+    if missing == ["scale_2"]:
+        raise InputError(
+            f"{path} lacks scale_2: it is a model of 2D Gaussian Splatting, whose disks are drawn otherwise: train the "
+            "capture anew as 3DGS, or draw it with the program that trained it"
+        )
+    if missing:
         raise InputError(
             f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}, as a mesh, a "
             "cloud of points or a compressed .ply does: give the .ply that a 3DGS trainer exports"
@@ -90,7 +106,35 @@ def read_ply(path: str | Path) -> Gaussians:
     values["opacities"] = values["opacities"][:, 0]
     values["sh0"] = values["sh0"][:, None]
     values["shN"] = values["shN"].view(count, 3, bands).transpose(1, 2).contiguous()
-    return Gaussians(**values)
+    gaussians = Gaussians(**values)
+    if "filter_3D" not in vertices:
+        return gaussians
+    return _fused(gaussians, torch.from_numpy(vertices["filter_3D"].astype(np.float64)))
+
+
+def load_ply(path: str | Path, frame: Frame | None = None) -> Gaussians:
+    """The model of `read_ply` as training and rendering take it (`placed`), in a frame of the file's coordinates."""
+    return placed(read_ply(path), Similarity.into(frame or Frame(np.zeros(3), 1.0)), path)
+
+
+def is_antialiased_ply(path: Path) -> bool:
+    """Whether a comment of the header says that the model is drawn with antialiasing. Raises `OSError`."""
+    with path.open("rb") as file:
+        return (
+            ANTIALIASED.search(file.read(HEADER_AT_MOST).replace(b"\r", b"\n").partition(b"\nend_header")[0])
+            is not None
+        )
+
+
+def _fused(gaussians: Gaussians, sizes: Tensor) -> Gaussians:
+    """The model with a 3D filter applied (Yu et al. 2024, "Mip-Splatting", equation 7).
+
+    Args:
+        sizes: [N] standard deviations of the filter.
+    """
+    scales = 0.5 * torch.logaddexp(2.0 * gaussians.scales, 2.0 * sizes.log()[:, None])
+    opacities = torch.sigmoid(gaussians.opacities) * (gaussians.scales - scales).sum(dim=1).exp()
+    return replace(gaussians, scales=scales, opacities=torch.logit(opacities))
 
 
 def _property_groups(bands: int) -> dict[str, list[str]]:

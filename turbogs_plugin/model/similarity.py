@@ -21,6 +21,8 @@ SAMPLED_DIRECTIONS = 64
 """Directions by which the rotation of harmonics is found; the largest degree has 7 functions."""
 LARGEST_ROUNDING = 1e-4
 """Largest `rounding` that a file of single precision may have."""
+OPAQUE, FLAT = 20.0, -20.0
+"""Logit of an opacity that a file has as infinite (to float32, 1 is its sigmoid), and logarithm of a scale of 0."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +70,15 @@ class Similarity:
         return replace(gaussians, means=means, scales=scales)
 
 
+IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
+
+
 def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaussians:
     """A file's model in other coordinates, as training and rendering take it.
 
     Args:
-        gaussians: float64, as the file has them. Those that are not finite are left out, with a warning that counts
-            them.
+        gaussians: float64, as the file has them. Infinite opacities and scales of 0 become finite. Those that are not
+            finite are left out, with a warning that counts them, and with one that counts flat ones.
         change: from the file's coordinates.
         source: the file, for messages.
 
@@ -83,6 +88,12 @@ def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaus
     Raises:
         InputError: no Gaussian is finite.
     """
+    if count := int((flat := gaussians.scales == -math.inf).any(dim=1).sum()):
+        warnings.warn(
+            f"{source}: {count} Gaussians are flat (a scale of 0, as of 2DGS): they are drawn thin", stacklevel=3
+        )
+    opacities = gaussians.opacities.where(~gaussians.opacities.isinf(), OPAQUE * gaussians.opacities.sign())
+    gaussians = replace(gaussians, opacities=opacities, scales=gaussians.scales.masked_fill(flat, FLAT))
     rows = change.apply(gaussians).map(lambda value: value.float().contiguous())
     return _finite(rows, source)
 
@@ -108,6 +119,25 @@ def in_capture(gaussians: Gaussians, frame: Frame, target: Path, double_means: b
         )
     means = means if double_means else means.float()
     return _finite(replace(rows, means=means, scales=rows.scales + math.log(frame.scale)), target)
+
+
+def upright(gaussians: Gaussians) -> Gaussians:
+    """A model in axes x right, y up, z backward in those x right, y down, z forward of captures, and back: y and z
+    change their sign in everything that depends on a direction."""
+    signs = gaussians.means.new_tensor([1.0, -1.0, -1.0])
+    direction = torch.tensor([[0.3, 0.5, 0.8124038404635961]], dtype=torch.float64)
+    values = (basis(each, gaussians.sh_degree)[0] for each in (direction, direction * signs.cpu()))  # [B] each
+    flips = torch.sign(torch.mul(*values)).to(gaussians.shN)  # each function is even or odd in y and z together
+    quats, shN = gaussians.quats * torch.cat([signs[:1], signs]), gaussians.shN * flips[:, None]
+    return replace(gaussians, means=gaussians.means * signs, quats=quats, shN=shN)
+
+
+def local_origin(frame: Frame) -> np.ndarray:
+    """[3] float64: where a file of single precision has its origin, in the capture's own coordinates. 0, unless the
+    capture lies so far from there that its positions would be rounded by more than `LARGEST_ROUNDING`; then near the
+    frame's centre, at numbers of few digits."""
+    far = rounding(frame) > LARGEST_ROUNDING
+    return np.round(frame.center, -math.floor(math.log10(frame.scale))) if far else np.zeros(3)
 
 
 def rounding(frame: Frame) -> float:

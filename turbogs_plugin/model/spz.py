@@ -1,9 +1,10 @@
-"""``.spz``, the compressed format of Niantic (https://github.com/nianticlabs/spz, MIT), in its version 3.
+"""``.spz``, the compressed format of Niantic (https://github.com/nianticlabs/spz, MIT): versions 2 and 3 are written,
+1 .. 4 read.
 
 A gzip stream of a header of 16 bytes and of one array after the other: positions, opacities, colours, scales,
-rotations, harmonics. Axes are x right, y up, z backward, where a capture's are x right, y down, z forward: so y and z
-change their sign, in everything that depends on a direction. Version 4 needs another compressor; all its readers read
-version 3, too. Version 2 has coarser rotations and is not read.
+rotations, harmonics. Axes are x right, y up, z backward (`upright`). Version 2 has coarser rotations, version 1
+positions in half precision, too. Version 4 has a plain header of 32 bytes, a table of sizes, and a zstd stream for each
+array that is not empty; all its readers read version 3, too.
 """
 
 from __future__ import annotations
@@ -11,24 +12,28 @@ from __future__ import annotations
 import gzip
 import math
 import struct
+import warnings
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from turbogs_plugin.engine.reference.spherical_harmonics import basis
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
-from turbogs_plugin.model.similarity import in_capture
+from turbogs_plugin.model.similarity import in_capture, upright
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import too_large
 from turbogs_plugin.types import Gaussians
 
 MAGIC = 0x5053474E
 VERSION = 3
-HEADER = struct.Struct("<IIIBBBB")
-"""Magic, version, number of Gaussians, degree, fractional bits of positions, flags, zero."""
+HEADER, STREAM = struct.Struct("<IIIBBBB"), struct.Struct("<QQ")
+"""Magic, version, number of Gaussians, degree, fractional bits of positions, flags, zero (in version 4 the number of
+streams, after which 4 bytes say where their table begins); a stream's bytes in the file, and unpacked."""
+ANTIALIASED, EXTENDED = 1, 2
+"""Flags: drawn with antialiasing; records of other makers follow (in version 4, before the table)."""
 MOST_FRACTIONAL_BITS = 20
 COLOR_SCALE = 0.15
 SH_SCALE = 128.0
@@ -40,84 +45,141 @@ LARGEST_COMPONENT = 511
 GZIP_LEVEL = 6
 
 
-def save_spz(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0) -> None:
+def save_spz(
+    gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, antialiased: bool = False, version: int = VERSION
+) -> None:
     """Write a model, whole or not at all, in the capture's own coordinates. Arguments and errors as of `in_capture`;
-    `step` has no place in this format. `InputError`, too, where positions are too large for it."""
-    gaussians = in_capture(gaussians, frame, path)
+    `step` has no place in this format. `InputError`, too, where positions are too large for it.
+
+    Args:
+        antialiased: how the model is drawn, which a flag says.
+        version: 2 or 3.
+    """
+    gaussians = upright(in_capture(gaussians, frame, path))
     values = {name: value.double().numpy() for name, value in gaussians.items()}
     largest = float(np.abs(values["means"]).max())
     bits = min(MOST_FRACTIONAL_BITS, 22 - max(0, math.ceil(math.log2(max(largest, 1e-9)))))
     if bits < 0:
         raise InputError(f"positions of {largest:.3g} units do not fit into a .spz: export with --format ply")
-    fixed = np.rint(values["means"] * [1.0, -1.0, -1.0] * 2.0**bits).astype("<i4")  # [N, 3]
+    fixed = np.rint(values["means"] * 2.0**bits).astype("<i4")  # [N, 3]
     opacities = 1.0 / (1.0 + np.exp(-values["opacities"]))
-    harmonics = values["shN"] * _flips(gaussians.sh_degree)[:, None]  # [N, B, 3]
+    quats = values["quats"][:, [1, 2, 3, 0]]
+    quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
+    positive = np.where(quats[:, 3:] < 0, -quats, quats)[:, :3]
+    rotations = _packed_rotations(quats).tobytes() if version > 2 else _bytes(127.5 * positive + 127.5)
     parts = [
-        HEADER.pack(MAGIC, VERSION, len(gaussians), gaussians.sh_degree, bits, 0, 0),
+        HEADER.pack(MAGIC, version, len(gaussians), gaussians.sh_degree, bits, ANTIALIASED * antialiased, 0),
         fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes(),
         _bytes(opacities * 255.0),
         _bytes(values["sh0"][:, 0] * (COLOR_SCALE * 255.0) + 127.5),
         _bytes((values["scales"] + 10.0) * 16.0),
-        _packed_rotations(values["quats"][:, [1, 2, 3, 0]] * [1.0, -1.0, -1.0, 1.0]).tobytes(),
-        _bytes(harmonics * SH_SCALE + 128.0),
+        rotations,
+        _bytes(values["shN"] * SH_SCALE + 128.0),
     ]
     content = gzip.compress(b"".join(parts), GZIP_LEVEL, mtime=0)
     write_atomically(path, lambda file: file.write(content))
+
+
+def is_antialiased_spz(path: Path) -> bool:
+    """Whether a flag says that the model, which `read_spz` takes, is drawn with antialiasing. Raises `OSError`."""
+    with path.open("rb") as file:
+        return bool(_header(file.read(1 << 12))[1][5] & ANTIALIASED)
 
 
 def read_spz(path: Path) -> Gaussians:
     """A model in x right, y down, z forward; float64, on the CPU.
 
     Raises:
-        InputError: the file is not a whole one of this format, in version 3.
+        InputError: the file is not a whole one of this format, or of version 4 where zstandard is not installed.
     """
-    try:
-        unpacker, content = zlib.decompressobj(wbits=31), path.read_bytes()
-        header = unpacker.decompress(content, HEADER.size).ljust(HEADER.size, b"\0")
-        magic, version, count, degree, bits, _, _ = HEADER.unpack(header)
-        if (magic, version) != (MAGIC, VERSION) or degree > 3 or not count:
-            raise InputError(f"{path} is no .spz of version 3 with Gaussians of degree 3 or less: export it again")
-        bands = (degree + 1) ** 2 - 1
-        widths = (9, 1, 3, 3, 4, 3 * bands)
-        size = count * sum(widths)
-        if too_large(size):
-            raise InputError(f"{path} announces {count} Gaussians, more than fit in the free memory: export it again")
-        body = unpacker.decompress(unpacker.unconsumed_tail, size + 1)
-    except (OSError, zlib.error) as error:
-        raise InputError(f"cannot read {path} as .spz: {error}; export it again") from None
-    if len(body) != size or not unpacker.eof:
-        raise InputError(f"{path} does not hold the {count} Gaussians that it announces: export it again")
-    ends = count * np.cumsum((0, *widths))
-    means, opacities, colors, scales, rotations, harmonics = (
-        np.frombuffer(body[start:end], dtype=np.uint8).reshape(count, width)
-        for start, end, width in zip(ends, ends[1:], widths, strict=False)
-    )
-    words = np.ascontiguousarray(rotations).view("<u4")[:, 0]
-    wide = np.zeros((count, 3, 4), dtype=np.uint8)
-    wide[:, :, 1:] = means.reshape(count, 3, 3)  # in the upper bytes, so that the sign is theirs
+    version, bits, (means, opacities, colors, scales, rotations, harmonics) = _unpacked(path)
+    count = len(opacities)
+    if version == 1:
+        warnings.warn(f"{path} is of version 1, which has positions in half precision: export it again", stacklevel=2)
+        places = means.view("<f2").astype(np.float64)
+    else:
+        wide = np.zeros((count, 3, 4), dtype=np.uint8)
+        wide[:, :, 1:] = means.reshape(count, 3, 3)  # in the upper bytes, so that the sign is theirs
+        places = (wide.view("<i4")[:, :, 0] >> 8) / 2.0**bits
+    if version > 2:
+        quats = _unpacked_rotations(rotations.view("<u4")[:, 0])
+    else:
+        quats = np.c_[rotations / 127.5 - 1.0, np.zeros(count)]
+        quats[:, 3] = np.sqrt(np.maximum(0.0, 1.0 - np.square(quats).sum(axis=1)))
     shares = (opacities[:, 0] / 255.0).clip(1e-4, 1.0 - 1e-4)
     values = {
-        "means": (wide.view("<i4")[:, :, 0] >> 8) / 2.0**bits * [1.0, -1.0, -1.0],
-        "quats": (_unpacked_rotations(words) * [1.0, -1.0, -1.0, 1.0])[:, [3, 0, 1, 2]],
+        "means": places,
+        "quats": quats[:, [3, 0, 1, 2]],
         "scales": scales / 16.0 - 10.0,
         "opacities": np.log(shares / (1.0 - shares)),
         "sh0": ((colors / 255.0 - 0.5) / COLOR_SCALE)[:, None],
-        "shN": (harmonics.reshape(count, bands, 3) - 128.0) / SH_SCALE * _flips(degree)[:, None],
+        "shN": (harmonics.reshape(count, -1, 3) - 128.0) / SH_SCALE,
     }
-    return Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in values.items()})
+    return upright(Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in values.items()}))
 
 
-def _flips(degree: int) -> np.ndarray:
-    """[B] signs of the harmonics where y and z change theirs: each function is even or odd in them together."""
-    direction = torch.tensor([[0.3, 0.5, 0.8124038404635961]], dtype=torch.float64)
-    mirrored = direction * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-    return torch.sign(basis(direction, degree) * basis(mirrored, degree))[0].numpy()
+def _header(content: bytes) -> tuple[Any, tuple[int, ...]]:
+    """What goes on to unpack a file, None for version 4, and the header; of a file's first bytes or all of them."""
+    if content.startswith(MAGIC.to_bytes(4, "little")):
+        return None, HEADER.unpack(content[: HEADER.size].ljust(HEADER.size, b"\0"))
+    unpacker = zlib.decompressobj(wbits=31)
+    return unpacker, HEADER.unpack(unpacker.decompress(content, HEADER.size).ljust(HEADER.size, b"\0"))
 
 
-def _packed_rotations(quats: np.ndarray) -> np.ndarray:
-    """[N] uint32 of [N, 4] quaternions of any norm, xyzw: the place of the largest component in 2 bits, then the others
-    in their order, a sign and 9 bits each."""
-    unit = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
+def _unpacked(path: Path) -> tuple[int, int, list[np.ndarray]]:
+    """Version, fractional bits, and the bytes [N, ...] uint8 of the six arrays."""
+    version = VERSION
+    try:
+        content = path.read_bytes()
+        unpacker, (magic, version, count, degree, bits, flags, streams) = _header(content)
+        if magic != MAGIC or version not in ((1, 2, 3) if unpacker else (4,)) or degree > 3 or not count:
+            raise InputError(
+                f"{path} is no .spz of version 1 .. 4 with Gaussians of degree 3 or less: convert what it was made of"
+            )
+        widths = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1))
+        size = count * sum(widths)
+        if too_large(size):
+            raise InputError(f"{path} announces {count} Gaussians, more than fit in the free memory: export it again")
+        if unpacker:
+            body = unpacker.decompress(unpacker.unconsumed_tail, size + 1)
+            whole = (len(body) == size and unpacker.eof) or (len(body) > size and flags & EXTENDED)
+        else:
+            body = _of_streams(content, streams, [count * width for width in widths if width])
+            whole = len(body) == size
+    except ImportError:
+        raise InputError(
+            f"{path} is of version 4, which needs zstandard: pip install zstandard, or convert it by "
+            f"npx @playcanvas/splat-transform {path} model.ply"
+        ) from None
+    except (OSError, zlib.error, struct.error) as error:
+        raise InputError(f"cannot read {path} as .spz of version {version}: {error}; export it again") from None
+    if not whole:
+        raise InputError(
+            f"{path}, of version {version}, does not hold the {count} Gaussians that it announces: export it again"
+        )
+    arrays = np.split(np.frombuffer(body, dtype=np.uint8, count=size), count * np.cumsum(widths[:-1]))
+    return version, bits, [array.reshape(count, width) for array, width in zip(arrays, widths, strict=True)]
+
+
+def _of_streams(content: bytes, streams: int, sizes: list[int]) -> bytes:
+    """What the streams of version 4 hold, which must have `sizes`; less where one is damaged."""
+    import zstandard
+
+    (table,) = struct.unpack_from("<I", content, HEADER.size)
+    start, parts = table + streams * STREAM.size, []
+    for number, size in enumerate(sizes if streams == len(sizes) else ()):
+        length, _ = STREAM.unpack_from(content, table + number * STREAM.size)
+        try:
+            parts.append(zstandard.ZstdDecompressor().stream_reader(content[start : start + length]).read(size))
+        except zstandard.ZstdError as error:
+            raise zlib.error(str(error)) from None
+        start += length
+    return b"".join(parts)
+
+
+def _packed_rotations(unit: np.ndarray) -> np.ndarray:
+    """[N] uint32 of [N, 4] unit quaternions, xyzw: the place of the largest component in 2 bits, then the others in
+    their order, a sign and 9 bits each."""
     largest = np.abs(unit).argmax(axis=1)
     unit = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -unit, unit)
     sizes = np.floor(LARGEST_COMPONENT * np.abs(unit) * math.sqrt(2.0) + 0.5).clip(0, LARGEST_COMPONENT)

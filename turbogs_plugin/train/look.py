@@ -67,17 +67,20 @@ class Look:
         settings: of the rasterizer.
         background: behind the model, and behind transparent photos.
         exposures: [V, 3, 4] of the views (`interpolated_exposures`); None: the model's own colours.
+        antialiased: as of `render_image`.
     """
 
     sh_degree: int
     settings: RasterSettings
     background: Color = BLACK
     exposures: Tensor | None = None
+    antialiased: bool = False
 
     @property
     def options(self) -> dict[str, Any]:
         """Options of `render_image` for the model's own colours."""
-        return {"sh_degree": self.sh_degree, "settings": self.settings, "background": self.background}
+        options = {"sh_degree": self.sh_degree, "settings": self.settings, "background": self.background}
+        return options | {"antialiased": self.antialiased}
 
     def colors(self, colors: Tensor, view_id: int) -> Tensor:
         """[H, W, 3], 0 .. 1: the model's own colours [H, W, 3], seen by a view, with its exposure."""

@@ -1,13 +1,15 @@
 """Models to render, measure, hand over or start from: a run's newest one, or one that was trained anywhere.
 
-A model from a file is taken to be in its capture's own coordinates. gsplat's example trainer works in others unless it
-is told not to (`turbogs_plugin.model.gsplat_world`); `train.init_world` says which.
+A model from a file is taken to be in its capture's own coordinates, or where its points lie by nerfstudio's file beside
+it (`turbogs_plugin.model.placement`). gsplat's example trainer works in others unless it is told not to
+(`turbogs_plugin.model.gsplat_world`); `train.init_world` says which.
 """
 
 from __future__ import annotations
 
 import operator
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +22,9 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.gsplat_file import read_gsplat
-from turbogs_plugin.model.gsplat_world import out_of_gsplat_world
-from turbogs_plugin.model.similarity import Similarity, placed
+from turbogs_plugin.model.gsplat_world import gsplat_worlds
+from turbogs_plugin.model.placement import TRANSFORMS, nearest_change, out_of_nerfstudio
+from turbogs_plugin.model.similarity import IDENTITY, Similarity, local_origin, placed
 from turbogs_plugin.model.torch_file import read_plain
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.fingerprint import frame_of_state
@@ -33,6 +36,25 @@ from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
 
 REMEDY = "; save the model again, or as a .ply"
 KINDS = "a .ply, .spz or gsplat's .pt of a 3DGS model, a checkpoint of TurboGS, or a run's folder"
+_SPLAT_TRANSFORM = "convert it by  npx @playcanvas/splat-transform '{}' model.ply"
+_OTHERS = {
+    **dict.fromkeys(("sog", "splat", "ksplat", "lcc", "glb", "gltf"), _SPLAT_TRANSFORM),
+    **dict.fromkeys(("usd", "usda", "usdc", "usdz", "splatv", "rad"), "export the .ply of its model from its program"),
+    "ckpt": "export it by  ns-export gaussian-splat --load-config CONFIG.yml --output-dir FOLDER",
+    "pth": "give the point_cloud/iteration_N/point_cloud.ply of its training",
+}
+"""Suffix of a model that is not read -> how to make a `.ply` of it."""
+_FOLDERS = (
+    "checkpoints/iteration-*.pt",
+    "point_cloud/iteration_*/point_cloud.ply",
+    "ckpts/ckpt_*_rank0.pt",
+    "ply/*.ply",
+)
+"""Models in folders of trainings: of TurboGS, Inria's 3DGS and gsplat."""
+FARTHEST_POINTS, FEWEST_POINTS = 0.2, 1000
+"""`nearest_change` beyond which a model does not fit its capture. In five captures a model of half the points, its
+colours off by 0.08, has 0.06 to 0.08 beside the other half, and 0.13 to 1.4 turned or scaled about its middle. Fewer
+points lie too far apart to tell."""
 
 
 @dataclass
@@ -42,6 +64,7 @@ class SavedModel:
     Args:
         folder, iteration: of the run; None for a model from a file.
         exposures: [V, 3, 4] of the training photos; None where none were learnt, and for a model from a file.
+        antialiased: how it is drawn, as of `render_image`.
     """
 
     folder: RunFolder | None
@@ -50,6 +73,7 @@ class SavedModel:
     frame: Frame
     iteration: int | None
     exposures: Tensor | None = None
+    antialiased: bool = False
 
     @property
     def sh_degree(self) -> int:
@@ -61,7 +85,7 @@ class SavedModel:
         capture if there is one."""
         transparent = views is not None and views.photos.transparent
         background = Background.of(self.config.train.background, transparent).evaluated
-        return Look(self.sh_degree, self.config.raster, background)
+        return Look(self.sh_degree, self.config.raster, background, antialiased=self.antialiased)
 
 
 def load_model(path: Path, device: torch.device) -> SavedModel:
@@ -109,7 +133,7 @@ def load_with_capture(
         require_model(path)  # before its capture is read
         scene = open_scene(given)
         gaussians = load_given(path, scene, given.train.init_world).map(lambda value: value.to(device))
-        return SavedModel(None, given, gaussians, scene.frame, None), scene, ""
+        return SavedModel(None, given, gaussians, scene.frame, None, None, is_antialiased(path)), scene, ""
     model = load_model(path, device)
     try:
         return model, open_scene(model.config), ""
@@ -120,26 +144,36 @@ def load_with_capture(
 
 
 def require_model(path: str | Path) -> Path:
-    """The file of a model: itself, or the newest checkpoint of a run's folder.
+    """The file of a model: itself, or the newest one in the folder of a training (`_FOLDERS`).
 
     Raises:
         InputError: there is none, or it is of no kind that is read.
     """
     path = Path(path)
     if path.is_dir():
-        checkpoint = latest_checkpoint(path / "checkpoints")
-        if checkpoint is None:
+        found = next(filter(None, (list(path.glob(pattern)) for pattern in _FOLDERS)), [])
+        if not found:
             raise InputError(f"'{path}' is a folder without a checkpoint of a run: give {KINDS}")
-        return checkpoint
+        return max(found, key=lambda file: [int(number) for number in re.findall(r"\d+", str(file.relative_to(path)))])
     if not path.is_file():
         raise InputError(f"no such model '{path}': give {KINDS}")
-    if path.suffix.lower().removeprefix(".") not in FORMATS:
+    kind = path.suffix.lower().removeprefix(".")
+    if kind in _OTHERS:
+        raise InputError(f"'{path}' is a .{kind}, which is not read: {_OTHERS[kind].format(path)}")
+    if kind not in FORMATS:
         raise InputError(f"'{path}' is no model: give {KINDS}")
     return path
 
 
+def is_antialiased(path: str | Path) -> bool:
+    """Whether a model's file, which `read_given` takes, says that it is drawn with antialiasing."""
+    file = require_model(path)
+    return FORMATS[file.suffix.lower().removeprefix(".")].is_antialiased(file)
+
+
 def load_given(path: str | Path, scene: Scene, world: str = "capture") -> Gaussians:
-    """A model from a file, in the frame of a scene. A warning counts Gaussians that are not finite, which are left out.
+    """A model from a file, in the frame of a scene. Warnings count Gaussians that are not finite, which are left out,
+    and say that a model does not fit the capture's points.
 
     Args:
         path: as `require_model` takes it.
@@ -152,17 +186,35 @@ def load_given(path: str | Path, scene: Scene, world: str = "capture") -> Gaussi
     Raises:
         InputError: the file is no such model, or the capture does not determine gsplat's world.
     """
-    into = Similarity.into(scene.frame)
     gaussians, to_capture = read_given(path)
-    if to_capture is None and world == "gsplat":
-        points = scene.frame.restore_points(scene.points.cpu().numpy())
-        to_capture = out_of_gsplat_world(gaussians, _own_viewmats(scene), points, scene.point_colors.cpu().numpy())
-        if to_capture is None:
+    if to_capture is None:
+        to_capture = _to_capture(gaussians, require_model(path), scene, world)
+    return placed(gaussians, Similarity.into(scene.frame).after(to_capture), path)
+
+
+def _to_capture(gaussians: Gaussians, path: Path, scene: Scene, world: str) -> Similarity:
+    """The change of a file's model to its capture's own coordinates."""
+    points = scene.frame.restore_points(scene.points.cpu().numpy())
+    if world == "gsplat":
+        changes = [change.inverse() for change in gsplat_worlds(_own_viewmats(scene), points)]
+        if not changes:
             raise InputError(
                 f"{path}: the cameras and points of {scene.name} do not determine gsplat's normalised world: train the "
                 "model with --no-normalize-world-space, and leave train.init_world out"
             )
-    return placed(gaussians, into if to_capture is None else into.after(to_capture), path)
+    else:
+        about = Similarity(np.eye(3), 1.0, local_origin(scene.frame))  # as exports are, far from the origin
+        changes = [*out_of_nerfstudio(path), IDENTITY, *([about] if about.translation.any() else [])]
+    if scene.drawn_points:
+        return changes[0]
+    change, apart = nearest_change(gaussians, changes, points, scene.point_colors.cpu().numpy())
+    if len(points) >= FEWEST_POINTS and apart > FARTHEST_POINTS:
+        warnings.warn(
+            f"{path} does not fit the points of {scene.name}: it is of another capture or in other coordinates; say "
+            f"train.init_world=gsplat for gsplat's normalised ones, or put nerfstudio's {TRANSFORMS} beside it",
+            stacklevel=3,
+        )
+    return change
 
 
 def read_given(path: str | Path) -> tuple[Gaussians, Similarity | None]:

@@ -6,6 +6,7 @@ taken back where an engine had too little memory, and shown. The first error map
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,7 +29,7 @@ from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.scene.offload import OffloadedErrorMaps, place_views
 from turbogs_plugin.train.look import Background, Look, interpolated_exposures
 from turbogs_plugin.train.parameter_mean import ParameterMean
-from turbogs_plugin.train.saved_model import load_given
+from turbogs_plugin.train.saved_model import is_antialiased, load_given
 from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
 
 STATEFUL = ("maps", "view_sampler", "optimizer", "density")
@@ -276,6 +277,8 @@ def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
         gaussians = gaussians_from_points(points[rows], colors[rows], *settings)
     else:
         gaussians = with_degree(load_given(init, scene, train.init_world), train.sh_degree)
+        if is_antialiased(init):
+            warnings.warn(f"'{init}' is of antialiased training: it goes on without, thicker at first", stacklevel=2)
         if cap and len(gaussians) + others > cap:
             raise InputError(
                 f"'{init}' has {len(gaussians)} Gaussians, more than density.max_gaussians {cap} allows beside "

@@ -1,0 +1,114 @@
+"""Models as scenes: glTF with KHR_gaussian_splatting, and OpenUSD's ParticleField3DGaussianSplat (of version 26.03).
+
+All numbers are float32, as trained; axes are x right, y up, z backward.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import write_atomically, write_text_atomically
+from turbogs_plugin.model.similarity import in_capture, upright
+from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.types import SH_C0, Gaussians
+
+GLTF = "KHR_gaussian_splatting"
+FLOAT, VERTICES, POINTS = 5126, 34962, 0
+"""glTF's numbers for float32, for a buffer of vertices, and for primitives that are points."""
+LARGEST_GLB = 2**32 - 1
+ROWS_AT_ONCE = 10_000
+"""Rows of numbers that become text at a time."""
+
+
+def save_glb(gaussians: Gaussians, path: Path, frame: Frame) -> None:
+    """Write a binary glTF, whole or not at all: points, whose attributes a reader of the extension draws as Gaussians.
+
+    Arguments and errors as of `in_capture`; `InputError`, too, for more than 4 GB.
+    """
+    model = upright(in_capture(gaussians, frame, path))
+    color = (SH_C0 * model.sh0[:, 0] + 0.5).clamp(0.0, 1.0)
+    linear = torch.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)  # as glTF has COLOR_0
+    opacities = torch.sigmoid(model.opacities)[:, None]
+    columns = {
+        "POSITION": model.means,
+        "COLOR_0": torch.cat([linear, opacities], dim=1),
+        f"{GLTF}:ROTATION": _unit(model)[:, [1, 2, 3, 0]],
+        f"{GLTF}:SCALE": model.scales.exp(),
+        f"{GLTF}:OPACITY": opacities,
+        f"{GLTF}:SH_DEGREE_0_COEF_0": model.sh0[:, 0],
+    }
+    for band in range(model.shN.shape[1]):
+        degree = math.isqrt(band + 1)
+        columns[f"{GLTF}:SH_DEGREE_{degree}_COEF_{band + 1 - degree**2}"] = model.shN[:, band]
+    views, accessors, parts, start = [], [], [], 0
+    for column in columns.values():
+        parts.append(column.numpy().astype("<f4").tobytes())
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": len(parts[-1]), "target": VERTICES})
+        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[column.shape[1]]
+        accessors.append({"bufferView": len(accessors), "componentType": FLOAT, "count": len(model), "type": kind})
+        start += len(parts[-1])
+    accessors[0] |= {"min": model.means.amin(dim=0).tolist(), "max": model.means.amax(dim=0).tolist()}
+    primitive = {
+        "attributes": {name: number for number, name in enumerate(columns)},
+        "mode": POINTS,
+        "extensions": {GLTF: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+    }
+    content = {
+        "asset": {"version": "2.0", "generator": "TurboGS"},
+        "extensionsUsed": [GLTF],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": start}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    size = 12 + 8 + len(text) + 8 + start
+    if size > LARGEST_GLB:
+        raise InputError(f"{path} would have {size} bytes, more than a .glb can: export fewer by --max-gaussians")
+    head = struct.pack("<4sIII4s", b"glTF", 2, size, len(text), b"JSON") + text + struct.pack("<I4s", start, b"BIN\0")
+    write_atomically(path, lambda file: file.writelines([head, *parts]))
+
+
+def save_usda(gaussians: Gaussians, path: Path, frame: Frame) -> None:
+    """Write OpenUSD's text, whole or not at all. Arguments and errors as of `in_capture`."""
+    model = upright(in_capture(gaussians, frame, path))
+    scales = model.scales.exp()
+    reach = 3.0 * scales.amax(dim=1, keepdim=True)
+    attributes = {
+        "float3[] extent": torch.stack([(model.means - reach).amin(dim=0), (model.means + reach).amax(dim=0)]),
+        "point3f[] positions": model.means,
+        "quatf[] orientations": _unit(model),
+        "float3[] scales": scales,
+        "float[] opacities": torch.sigmoid(model.opacities),
+        "float3[] radiance:sphericalHarmonicsCoefficients": torch.cat([model.sh0, model.shN], dim=1).flatten(0, 1),
+    }
+    lines = [
+        '#usda 1.0\n(\n    defaultPrim = "Model"\n    metersPerUnit = 1\n    upAxis = "Y"\n)\n',
+        'def Xform "Model"\n{\n    def ParticleField3DGaussianSplat "Gaussians"\n    {',
+        *(f"        {name} = [{_tuples(values.numpy())}]" for name, values in attributes.items()),
+        f"        uniform int radiance:sphericalHarmonicsDegree = {model.sh_degree}\n    }}\n}}\n",
+    ]
+    write_text_atomically(path, "\n".join(lines))
+
+
+def _unit(model: Gaussians) -> torch.Tensor:
+    """[N, 4] unit quaternions, wxyz."""
+    return torch.nn.functional.normalize(model.quats, dim=1)
+
+
+def _tuples(values: np.ndarray) -> str:
+    """Numbers [N], or tuples of numbers [N, D], with nine digits, which give back every float32."""
+    item = "%.9g" if values.ndim == 1 else f"({', '.join(['%.9g'] * values.shape[1])})"
+    parts = (values[start : start + ROWS_AT_ONCE] for start in range(0, len(values), ROWS_AT_ONCE))
+    return ", ".join(", ".join([item] * len(part)) % tuple(part.flatten().tolist()) for part in parts)

@@ -1,0 +1,86 @@
+"""The coordinates that a model's file is in: which change brings it to where its capture's points are.
+
+nerfstudio centres, turns and scales the poses that it trains on, and writes the change (``dataparser_transforms.json``)
+into the folder of the training: ``new = scale * (transform @ old)``. Its old coordinates are COLMAP's, or those of a
+``transforms.json`` by `ns-process-data`, which turns COLMAP's axes once more.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from turbogs_plugin.captures.camera_json import read_json
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.similarity import Similarity
+from turbogs_plugin.types import SH_C0, Gaussians
+
+TRANSFORMS = "dataparser_transforms.json"
+TURNS = tuple(np.array(turn, dtype=np.float64) for turn in (
+    [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    [[0, 1, 0], [1, 0, 0], [0, 0, -1]],
+))  # fmt: skip
+"""COLMAP's axes to those of `ns-process-data`: not at all, as it does since 1.0, and as it did before."""
+POINTS_AT_MOST, GAUSSIANS_AT_MOST = 20_000, 200_000
+COLOR_WEIGHT = 1.0
+"""Distance, in units of the cloud's size, that counts as much as a channel's whole range."""
+
+
+def nearest_change(
+    gaussians: Gaussians, changes: list[Similarity], points: np.ndarray, colors: np.ndarray
+) -> tuple[Similarity, float]:
+    """The change by which the points of a capture lie nearest to a model's Gaussians, in place and colour.
+
+    Args:
+        gaussians: float64; rows may be not finite.
+        changes: from the model's coordinates to the capture's own; at least one.
+        points: [M, 3] float64, in the capture's own coordinates; M >= 1.
+        colors: [M, 3] uint8 of the points.
+
+    Returns:
+        The change, and the median distance of a point from the nearest Gaussian, over the points' median distance from
+        their middle.
+    """
+    from scipy.spatial import cKDTree
+
+    every = slice(None, None, -(-len(points) // POINTS_AT_MOST))
+    points, shades = points[every], COLOR_WEIGHT * colors[every] / 255.0
+    middle = np.median(points, axis=0)
+    size = float(np.median(np.linalg.norm(points - middle, axis=1))) or 1.0
+    wanted = np.concatenate([(points - middle) / size, shades], axis=1)
+    means = gaussians.means.numpy()
+    rows = np.concatenate([means, COLOR_WEIGHT * (SH_C0 * gaussians.sh0[:, 0].numpy() + 0.5)], axis=1)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    rows = rows[:: -(-len(rows) // GAUSSIANS_AT_MOST) or 1]
+    apart = []
+    for change in changes:
+        places = (change.scale * rows[:, :3] @ change.rotation.T + change.translation - middle) / size
+        distances, _ = cKDTree(np.concatenate([places, rows[:, 3:]], axis=1)).query(wanted)
+        apart.append(float(np.median(distances)))  # passes over lone points; infinite without Gaussians
+    return changes[int(np.argmin(apart))], min(apart)
+
+
+def out_of_nerfstudio(file: Path) -> list[Similarity]:
+    """The changes from nerfstudio's world to what may be a capture's own coordinates; none where no ``TRANSFORMS`` lies
+    beside a file.
+
+    Raises:
+        InputError: that is no change.
+    """
+    source = file.parent / TRANSFORMS
+    if not source.is_file():
+        return []
+    content = read_json(source)
+    try:
+        matrix, scale = np.array(content["transform"], dtype=np.float64), float(content["scale"])
+        rotation = matrix[:, :3]
+        if matrix.shape != (3, 4) or not scale > 0 or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+            raise ValueError
+    except (KeyError, TypeError, ValueError, IndexError):
+        raise InputError(
+            f"{source} has no transform of 3x4 numbers and scale: copy it again from nerfstudio's output"
+        ) from None
+    back = Similarity(rotation, scale, scale * matrix[:, 3]).inverse()
+    return [Similarity(turn, 1.0, np.zeros(3)).after(back) for turn in TURNS]
