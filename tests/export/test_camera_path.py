@@ -1,6 +1,7 @@
 """Paths of cameras: through given ones, without jumps, about what they look at."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,8 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.camera_path import focus_and_up, from_file, interpolated, orbit, through_views
+from turbogs_plugin.model.placement import TRANSFORMS, TURNS
+from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.scene import Frame
-from turbogs_plugin.scene.geometry import camera_centers, look_at
+from turbogs_plugin.scene.geometry import look_at
 from turbogs_plugin.types import Cameras
 
 K = np.array([[50.0, 0, 24], [0, 50.0, 20], [0, 0, 1]])
@@ -67,28 +70,90 @@ def test_one_camera_alone(make):
     assert len(made) == 4 and bool(torch.isfinite(made.viewmats).all())
 
 
-def test_a_file_of_cameras_is_in_the_captures_coordinates(tmp_path):
+def scene_of(frame: Frame) -> SimpleNamespace:
+    """The part of a scene that a path needs: its frame, and points about what `ring` looks at."""
+    points = np.array([1.0, 2.0, 0.5]) + np.random.default_rng(0).normal(size=(50, 3)) * 0.3
+    return SimpleNamespace(frame=frame, points=torch.from_numpy(frame.normalise_points(points)))
+
+
+WORLD = Similarity(Rotation.from_euler("xyz", (0.4, -1.1, 0.2)).as_matrix(), 0.3, np.array([0.1, -0.2, 0.3]))
+
+
+def layouts(viewmats: np.ndarray) -> dict[str, object]:
+    """Cameras of 64x48 pixels, with focal lengths of 100 and 50 pixels, as programs write them."""
+    poses = [np.linalg.inv(viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0]) for viewmat in viewmats]  # OpenGL's axes
+    focal = (100.0, 50.0)
+    seen = {
+        "w": 64,
+        "h": 48,
+        "frames": [{"transform_matrix": p.tolist(), "fl_x": f} for p, f in zip(poses, focal, strict=True)],
+    }
+    sized = {
+        "frames": [
+            {"w": 64 * k, "h": 48 * k, "fl_x": f * k, "transform_matrix": p.tolist()}
+            for p, f, k in zip(poses, focal, (1, 2), strict=True)
+        ]
+    }
+    inria = [
+        {
+            "width": 64,
+            "height": 48,
+            "fx": f,
+            "fy": f,
+            "position": p[:3, 3].tolist(),
+            "rotation": (p[:3, :3] * [1, -1, -1]).tolist(),
+        }
+        for p, f in zip(poses, focal, strict=True)
+    ]
+    studio = {
+        "render_width": 64,
+        "render_height": 48,
+        "camera_path": [
+            {"camera_to_world": p.ravel().tolist(), "fov": float(np.degrees(2 * np.arctan(24 / f)))}
+            for p, f in zip(poses, focal, strict=True)
+        ],
+    }
+    return {"transforms": seen, "sized": sized, "inria": inria, "nerfstudio": studio}
+
+
+@pytest.mark.parametrize(
+    ("layout", "turn"),
+    [(name, None) for name in ("transforms", "sized", "inria", "nerfstudio")]
+    + [("nerfstudio", turn) for turn in TURNS],
+)
+def test_a_file_of_cameras_is_in_the_captures_coordinates(tmp_path, layout, turn):
+    """Or in nerfstudio's, whose file lies beside it."""
     frame = Frame(np.array([10.0, 0.0, 0.0]), 2.0)
     viewmats = ring(np.array([0.0, 0.5])).viewmats.double().numpy()
-    frames = []
-    for viewmat in viewmats:
-        pose = np.linalg.inv(viewmat)
-        pose[:3, 1:3] *= -1.0  # OpenGL's axes
-        frames.append({"transform_matrix": pose.tolist()})
-    content = {"w": 64, "h": 48, "camera_angle_x": 1.0, "frames": frames}
-    (tmp_path / "a.json").write_text(json.dumps(content))
-    made = from_file(tmp_path / "a.json", frame, 5)
-    expected = (camera_centers(viewmats) - frame.center) / 2.0
-    assert np.allclose(made.centers[[0, -1]].numpy(), expected, atol=1e-5)
-    assert made.sizes.tolist() == [[64, 48]] * 5 and float(made.Ks[0, 0, 0]) == pytest.approx(32 / np.tan(0.5))
+    given = viewmats
+    if turn is not None:
+        (tmp_path / TRANSFORMS).write_text(
+            json.dumps({"transform": np.c_[WORLD.rotation, WORLD.translation / 0.3].tolist(), "scale": 0.3})
+        )
+        given = WORLD.after(Similarity(turn, 1.0, np.zeros(3)).inverse()).apply_to_poses(viewmats)
+    (tmp_path / "a.json").write_text(json.dumps(layouts(given)[layout]))
+    made = from_file(tmp_path / "a.json", scene_of(frame), 5)
+    assert np.allclose(made.viewmats[[0, -1]].numpy(), frame.normalise_poses(viewmats), atol=1e-4)
+    assert made.sizes.tolist() == [[64, 48]] * 5
+    assert np.allclose(made.Ks[:, 0, 0].numpy(), np.linspace(100, 50, 5), rtol=1e-3)
 
 
 WRONG = ({"w": None}, {"w": 0}, {"fl_x": -1.0}, {"frames": []}, {"frames": [{}]}, {"frames": [{"transform_matrix": 1}]})
+WRONG += (
+    [{}],
+    [{"width": 9, "height": 9, "fx": 5, "rotation": [[1, 2], 3], "position": [1, 2, 3]}],
+    [1],
+    {"camera_path": []},
+)
+WRONG += ({"camera_path": [1], "render_width": 9, "render_height": 9}, {"camera_path": [{}], "camera_type": "fisheye"})
 
 
 @pytest.mark.parametrize("change", WRONG)
 def test_a_file_of_something_else_is_refused(tmp_path, change):
-    content = {"w": 64, "h": 48, "fl_x": 50.0, "frames": [{"transform_matrix": np.eye(4).tolist()}], **change}
-    (tmp_path / "a.json").write_text(json.dumps({name: value for name, value in content.items() if value is not None}))
+    content = change
+    if isinstance(change, dict) and "camera_path" not in change:
+        content = {"w": 64, "h": 48, "fl_x": 50.0, "frames": [{"transform_matrix": np.eye(4).tolist()}], **change}
+        content = {name: value for name, value in content.items() if value is not None}
+    (tmp_path / "a.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"a\.json"):
-        from_file(tmp_path / "a.json", Frame(np.zeros(3), 1.0), 3)
+        from_file(tmp_path / "a.json", scene_of(Frame(np.zeros(3), 1.0)), 3)

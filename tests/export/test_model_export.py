@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from turbogs_plugin.captures import load_scene
+from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.commands.options import GivenOptions
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.export import renders
 from turbogs_plugin.export.model_export import EXPORTS, contributions, pruned
-from turbogs_plugin.model.ply import load_ply
+from turbogs_plugin.model.formats import FORMATS
+from turbogs_plugin.model.ply import load_ply, save_ply
+from turbogs_plugin.train.saved_model import load_given, load_model
 from turbogs_plugin.types import SH_C0, WHITE
 
 
@@ -43,15 +47,12 @@ def test_a_capture_far_from_its_origin_is_exported_about_another(turbogs, finish
     model = load_pycolmap().Reconstruction(moved / "sparse/0")
     model.transform(load_pycolmap().Sim3d(1.0, load_pycolmap().Rotation3d(), np.array([5e5, 5.4e6, 300.0])))
     model.write(moved / "sparse/0")
-    shutil.copytree(finished, tmp_path / "run")
-    config = tmp_path / "run/config.yaml"
-    config.write_text(config.read_text().replace(str(capture), str(moved)))
     given = ("--scene", moved, "--format", name, "--out", file)
     far = tmp_path / "far.ply"
     frame = load_scene(moved).frame
     save_ply(load_model(finished, torch.device("cpu")).gaussians, far, frame)
     code, out, err = turbogs("export", far, *given)
-    assert code == 0 and re.search(r"about the local origin 500\d\d\d 5\d{6} \d+", out), (out, err)
+    assert code == 0 and re.search(r"about the local origin (499|500)\d{3} 5\d{6} \d+", out), (out, err)
     before, after = map(float, re.search(r"PSNR   ([\d.]+) -> ([\d.]+) dB", out).groups())
     assert abs(before - after) < (1 if name in ("spz", "spz2") else 0.01)
     if name in FORMATS:

@@ -19,8 +19,8 @@ AXES = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
 
 
 def assert_alike(made: Gaussians, means, quats, scales, opacities, harmonics) -> None:
-    """Numpy arrays of a file's own meaning (y up, z backward; wxyz, linear scales and opacities, harmonics [N, B + 1, 3])
-    against the model in the capture's coordinates."""
+    """Numpy arrays of a file (y up, z backward; wxyz, linear scales and opacities, harmonics [N, B + 1, 3]) against the
+    model in the capture's coordinates."""
     means, quats, scales, opacities, harmonics = map(torch.from_numpy, (means, quats, scales, opacities, harmonics))
     own = made.means * 2.5 + torch.tensor([3.0, -2.0, 5.0])
     torch.testing.assert_close(means, own @ AXES, rtol=1e-5, atol=1e-5)

@@ -88,13 +88,6 @@ def test_spz_by_hand(tmp_path):
     assert list(body[20:]) == [128] * 9
 
 
-@pytest.mark.parametrize("name", ["pt", "spz"])
-def test_a_capture_far_from_its_origin_is_refused_in_single_precision(tmp_path, name):
-    with pytest.raises(InputError, match="--format ply"):
-        FORMATS[name].write(gaussians(), tmp_path / "m", Frame(np.array([5e8, 0.0, 0.0]), 1.0), 0, False)
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("damage", ["cut", "longer", "other"])
 def test_a_damaged_spz_is_refused(tmp_path, damage):
     file = tmp_path / "m"

@@ -21,6 +21,8 @@ from turbogs_plugin.model.gsplat_world import gsplat_worlds
 from turbogs_plugin.model.placement import TRANSFORMS, TURNS
 from turbogs_plugin.model.ply import read_ply, save_ply
 from turbogs_plugin.model.similarity import Similarity
+from turbogs_plugin.model.spz import save_spz
+from turbogs_plugin.scene import Frame
 from turbogs_plugin.train import run, saved_model
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.saved_model import load_given, load_model
@@ -156,6 +158,15 @@ def test_a_model_in_other_coordinates_is_said_not_to_fit(finished, capture, tmp_
     file = save_splats(tmp_path / "a.pt", change.apply(read_ply(finished / "model.ply")))
     with pytest.warns(UserWarning, match="does not fit the points"):
         load_given(file, load_scene(capture))
+
+
+def test_the_spz_of_splat_transform_is_turned_back(finished, capture, tmp_path):
+    turned = Similarity(np.diag([-1.0, 1.0, -1.0]), 1.0, np.zeros(3)).apply(read_ply(finished / "model.ply"))
+    scene, origin = load_scene(capture), Frame(np.zeros(3), 1.0)
+    for number, model in enumerate((turned, read_ply(finished / "model.ply"))):
+        save_spz(model.map(torch.Tensor.float), tmp_path / f"{number}.spz", origin)
+        loaded = load_given(tmp_path / f"{number}.spz", scene)
+        assert (loaded.means - load_model(finished, CPU).gaussians.means).abs().max() < 1e-3
 
 
 def test_the_newest_model_in_folders_of_other_trainers(finished, capture, tmp_path, turbogs):

@@ -74,7 +74,7 @@ def render(
         out: folder for the pictures; renders in the run's folder where absent. With --path the new file of the film
             (.mp4).
         path: write a film of 60 frames a second along a path: orbit, about what the capture shows; views, through its
-            training cameras; or a file of cameras in the layout of transforms.json.
+            training cameras; or a file of cameras: transforms.json's layout, nerfstudio's path, Inria's cameras.json.
         seconds: of the film; 10 where absent.
         device: where to render.
     """

@@ -124,7 +124,7 @@ def film_cameras(path: str, scene: Scene, seconds: float) -> Cameras:
     """The cameras of a film's frames, in the scene's frame."""
     frames = max(1, round(RATE * seconds))
     if path not in PATHS:
-        return from_file(Path(path), scene.frame, frames)
+        return from_file(Path(path), scene, frames)
     return (orbit if path == "orbit" else through_views)(scene.train.cameras, frames)
 
 

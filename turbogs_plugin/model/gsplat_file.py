@@ -29,7 +29,7 @@ def save_gsplat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0) -
         step: iterations of its training.
 
     Raises:
-        InputError: nothing to write, or a capture too far from its origin for float32.
+        InputError: nothing to write.
         OSError: from the disk.
     """
     splats = dict(in_capture(gaussians, frame, path).items())

@@ -53,6 +53,14 @@ class Similarity:
         moved = self.scale * self.rotation @ first.translation + self.translation
         return Similarity(self.rotation @ first.rotation, self.scale * first.scale, moved)
 
+    def apply_to_poses(self, viewmats: np.ndarray) -> np.ndarray:
+        """[V, 4, 4] world to camera in the old coordinates -> in the new ones. Camera coordinates scale with the world,
+        so rotations stay rotations."""
+        moved = viewmats.copy()
+        moved[:, :3, :3] = viewmats[:, :3, :3] @ self.rotation.T
+        moved[:, :3, 3] = self.scale * viewmats[:, :3, 3] - moved[:, :3, :3] @ self.translation
+        return moved
+
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """The model in the new coordinates, in its own dtype. Without a rotation, quaternions and harmonics keep
         their bits."""
@@ -68,9 +76,6 @@ class Similarity:
             )
         means, scales = self.scale * gaussians.means + translation, gaussians.scales + math.log(self.scale)
         return replace(gaussians, means=means, scales=scales)
-
-
-IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
 
 
 def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaussians:
@@ -99,24 +104,19 @@ def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaus
 
 
 def in_capture(gaussians: Gaussians, frame: Frame, target: Path, double_means: bool = False) -> Gaussians:
-    """A model as files have it: in the capture's own coordinates, float32 on the CPU.
+    """A model as files have it: in the capture's own coordinates, float32 on the CPU; means in float64 if
+    `double_means`, which a frame far from the capture's origin needs (`local_origin`).
 
     Args:
         gaussians: those that are not finite are left out, with a warning that counts them.
         frame: of the model's coordinates.
         target: the file, for messages.
-        double_means: keep means in float64, which nothing is too far for.
 
     Raises:
-        InputError: none is left, or the capture lies too far from its origin for float32.
+        InputError: none is left.
     """
     rows = gaussians.map(lambda value: value.detach().cpu().contiguous())
     means = torch.from_numpy(frame.restore_points(rows.means.numpy()))
-    if not double_means and rounding(frame) > LARGEST_ROUNDING:
-        raise InputError(
-            f"the capture lies {np.abs(frame.center).max():.3g} units from its origin, too far for {target} in single "
-            "precision: export with --format ply"
-        )
     means = means if double_means else means.float()
     return _finite(replace(rows, means=means, scales=rows.scales + math.log(frame.scale)), target)
 

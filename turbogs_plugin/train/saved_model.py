@@ -24,7 +24,7 @@ from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.gsplat_file import read_gsplat
 from turbogs_plugin.model.gsplat_world import gsplat_worlds
 from turbogs_plugin.model.placement import TRANSFORMS, nearest_change, out_of_nerfstudio
-from turbogs_plugin.model.similarity import IDENTITY, Similarity, local_origin, placed
+from turbogs_plugin.model.similarity import Similarity, local_origin, placed
 from turbogs_plugin.model.torch_file import read_plain
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.fingerprint import frame_of_state
@@ -38,8 +38,10 @@ REMEDY = "; save the model again, or as a .ply"
 KINDS = "a .ply, .spz or gsplat's .pt of a 3DGS model, a checkpoint of TurboGS, or a run's folder"
 _SPLAT_TRANSFORM = "convert it by  npx @playcanvas/splat-transform '{}' model.ply"
 _OTHERS = {
-    **dict.fromkeys(("sog", "splat", "ksplat", "lcc", "glb", "gltf"), _SPLAT_TRANSFORM),
-    **dict.fromkeys(("usd", "usda", "usdc", "usdz", "splatv", "rad"), "export the .ply of its model from its program"),
+    **dict.fromkeys(("sog", "splat", "ksplat", "lcc"), _SPLAT_TRANSFORM),
+    **dict.fromkeys(
+        ("glb", "gltf", "usd", "usda", "usdc", "usdz", "splatv"), "export a .ply from the program that made it"
+    ),
     "ckpt": "export it by  ns-export gaussian-splat --load-config CONFIG.yml --output-dir FOLDER",
     "pth": "give the point_cloud/iteration_N/point_cloud.ply of its training",
 }
@@ -193,7 +195,8 @@ def load_given(path: str | Path, scene: Scene, world: str = "capture") -> Gaussi
 
 
 def _to_capture(gaussians: Gaussians, path: Path, scene: Scene, world: str) -> Similarity:
-    """The change of a file's model to its capture's own coordinates."""
+    """The change of a file's model to its capture's own coordinates. Exports are about a `local_origin`; the .spz of
+    splat-transform, whose x is left and z forward, is turned about y beside Niantic's."""
     points = scene.frame.restore_points(scene.points.cpu().numpy())
     if world == "gsplat":
         changes = [change.inverse() for change in gsplat_worlds(_own_viewmats(scene), points)]
@@ -203,8 +206,10 @@ def _to_capture(gaussians: Gaussians, path: Path, scene: Scene, world: str) -> S
                 "model with --no-normalize-world-space, and leave train.init_world out"
             )
     else:
-        about = Similarity(np.eye(3), 1.0, local_origin(scene.frame))  # as exports are, far from the origin
-        changes = [*out_of_nerfstudio(path), IDENTITY, *([about] if about.translation.any() else [])]
+        turns = [np.eye(3), *([np.diag([-1.0, 1.0, -1.0])] if path.suffix.lower() == ".spz" else [])]
+        origins = dict.fromkeys(map(tuple, (np.zeros(3), local_origin(scene.frame))))
+        changes = out_of_nerfstudio(path)
+        changes += [Similarity(turn, 1.0, np.array(origin)) for turn in turns for origin in origins]
     if scene.drawn_points:
         return changes[0]
     change, apart = nearest_change(gaussians, changes, points, scene.point_colors.cpu().numpy())
