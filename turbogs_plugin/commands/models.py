@@ -102,7 +102,7 @@ def export(
     overrides: Overrides = (),
     /,
     *,
-    format: Annotated[str, arg(metavar="ply|pt|spz|spz2|glb|usda|html")] = "ply",
+    format: Annotated[str, arg(metavar="ply|pt|spz|spz2|splat|glb|usda|html")] = "ply",
     out: Path | None = None,
     max_gaussians: Count = None,
     cameras: FlagCreatePairsOff[bool] = False,
@@ -115,7 +115,8 @@ def export(
         run: folder of the run; or with --scene the file of a model; or with --cameras the folder of a COLMAP capture.
         overrides: with --scene, as in eval.
         format: ply: as the original 3DGS writes it, which viewers read. pt: a checkpoint of gsplat's simple_trainer,
-            which needs --no-normalize-world-space to take it. spz: smaller, with some loss; spz2: its older version.
+            which needs --no-normalize-world-space to take it. spz: smaller, with some loss; spz2: its older version;
+            splat: one colour each.
             glb: glTF with KHR_gaussian_splatting. usda: OpenUSD's ParticleField3DGaussianSplat.
             html: a page with the model to turn in a browser, without a network.
         out: new file; model.ply, model.pt, ..., or model.html in the run's folder where absent.

@@ -23,6 +23,7 @@ from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.html_page import html_page, page_gaussians
 from turbogs_plugin.export.scene_files import save_glb, save_usda
+from turbogs_plugin.export.splat_file import read_splat, save_splat
 from turbogs_plugin.files import require_new_file, write_text_atomically
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.similarity import Similarity, local_origin
@@ -49,6 +50,7 @@ class Export(NamedTuple):
 EXPORTS = {
     **{name: Export(name, each.write, each.read, name != "pt") for name, each in FORMATS.items()},
     "spz2": Export("spz", partial(save_spz, version=2), read_spz, True),
+    "splat": Export("splat", lambda model, path, frame, step, mip: save_splat(model, path, frame), read_splat),
     "glb": Export("glb", lambda model, path, frame, step, mip: save_glb(model, path, frame)),
     "usda": Export("usda", lambda model, path, frame, step, mip: save_usda(model, path, frame)),
 }
