@@ -40,8 +40,11 @@ def test_projection_and_its_gradients_are_gsplats(spread):
     rows, splats = project(gaussians, cameras)
 
     covariances, _ = _quat_scale_to_covar_preci(gaussians.quats, gaussians.scales.exp(), compute_preci=False)
-    theirs = _fully_fused_projection(gaussians.means, covariances, cameras.viewmats, cameras.Ks, 48, 32)
-    means2d, depths, conics = (value.flatten(0, 1)[rows.flat] for value in theirs[1:4])
+    theirs = _fully_fused_projection(
+        gaussians.means, covariances, cameras.viewmats, cameras.Ks, 48, 32, calc_compensations=True
+    )
+    means2d, depths, conics, shares = (value.flatten(0, 1)[rows.flat] for value in theirs[1:5])
+    torch.testing.assert_close(splats.shares, shares.detach(), rtol=1e-6, atol=1e-6)
     for ours, theirs in ((splats.means2d, means2d), (splats.depths, depths), (splats.conics, conics)):
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-11)
 

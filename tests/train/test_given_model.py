@@ -16,6 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import load_pycolmap
+from turbogs_plugin.commands.options import GivenOptions
+from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
+from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.gsplat_world import gsplat_worlds
 from turbogs_plugin.model.placement import TRANSFORMS, TURNS
@@ -167,6 +170,23 @@ def test_the_spz_of_splat_transform_is_turned_back(finished, capture, tmp_path):
         save_spz(model.map(torch.Tensor.float), tmp_path / f"{number}.spz", origin)
         loaded = load_given(tmp_path / f"{number}.spz", scene)
         assert (loaded.means - load_model(finished, CPU).gaussians.means).abs().max() < 1e-3
+
+
+def test_a_model_of_antialiased_training_is_drawn_as_it_was_trained(finished, capture, tmp_path):
+    saved, scene = load_model(finished, CPU), load_scene(capture)
+    save_ply(saved.gaussians, tmp_path / "a.ply", saved.frame, antialiased=True)
+    state = open_state(tmp_path / "a.ply", CPU, GivenOptions(scene=capture).settings(()))
+    seen = render_image(state.gaussians, scene.test.cameras, **state.look.options).colors
+    rows = drawable_rows(state.gaussians, scene.test.cameras, state.look.settings)
+    splats = project_rows(rows, rows.take(state.gaussians), scene.test.cameras, 0, state.look.settings)
+    thinner = rows.take(state.gaussians)
+    thinner.opacities, thinner.shN = torch.logit(splats.opacities * splats.shares), thinner.shN[rows.gaussians]
+    expected = render_image(thinner, scene.test.cameras, **state.look.options | {"antialiased": False}).colors
+    torch.testing.assert_close(seen, expected)
+    plain = render_image(state.gaussians, scene.test.cameras, **state.look.options | {"antialiased": False}).colors
+    assert (seen - plain).abs().max() > 0.01
+    with pytest.warns(UserWarning, match="antialiased training"):
+        Trainer(tiny_config(capture, f"train.init={tmp_path / 'a.ply'}").without_plan(), scene, CPU)
 
 
 def test_the_newest_model_in_folders_of_other_trainers(finished, capture, tmp_path, turbogs):

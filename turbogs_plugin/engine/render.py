@@ -39,8 +39,7 @@ class RenderedImage:
     Args:
         colors: [H, W, 3], not clamped above.
         alphas: [H, W].
-        depths: [H, W] expected depth along the camera's axis, in the unit of the means; 0 where nothing was hit. None
-            if not asked for.
+        depths: [H, W] expected, along the camera's axis, in the means' unit; 0 where nothing was hit. None: not asked.
     """
 
     colors: Tensor
@@ -52,12 +51,8 @@ class RenderedImage:
 def render_image(
     gaussians: Gaussians, cameras: Cameras, view_id: int = 0, antialiased: bool = False, **options: Any
 ) -> RenderedImage:
-    """Render every pixel of one of the cameras.
-
-    Args:
-        antialiased: as gsplat's ``rasterize_mode="antialiased"``: less opaque, the more `eps2d` adds to a splat.
-        options: the fields of `RenderOptions`.
-    """
+    """Render every pixel of one of the cameras; `options` are the fields of `RenderOptions`. `antialiased`: as gsplat's
+    mode of that name, in which a splat is the less opaque, the more `eps2d` adds to it."""
     samples, camera = dense_samples(cameras, [view_id]), cameras.select([view_id])
     if antialiased:
         settings = RenderOptions(**options).settings
@@ -65,8 +60,7 @@ def render_image(
         shares = rows.scatter(project_rows(rows, rows.take(gaussians), camera, 0, settings).shares)[0]
         gaussians = replace(gaussians, opacities=torch.logit(torch.sigmoid(gaussians.opacities) * shares))
     rendered = rasterize(gaussians, camera, samples, **options)
-    width, height = cameras.sizes[view_id].tolist()
-    places = samples.pixel_ids.long()
+    (width, height), places = cameras.sizes[view_id].tolist(), samples.pixel_ids.long()
 
     def image(values: Tensor) -> Tensor:
         return torch.empty_like(values).index_copy_(0, places, values).reshape(height, width, *values.shape[1:])

@@ -145,8 +145,7 @@ def _of_nerfstudio(content: dict[str, Any], path: Path) -> tuple[list[dict[str, 
         focal = 0.5 * height / math.tan(math.radians(angle) / 2) if height and angle and 0 < angle < 180 else None
         lenses.append({"w": width, "h": height} | ({} if focal is None else {"fl_x": focal}))
         matrix = values.get("camera_to_world")
-        rows = isinstance(matrix, list) and len(matrix) in (12, 16)
-        poses.append([matrix[start : start + 4] for start in range(0, len(matrix), 4)] if rows else matrix)
+        poses.append([matrix[row : row + 4] for row in range(0, len(matrix), 4)] if isinstance(matrix, list) else None)
     return lenses, poses
 
 

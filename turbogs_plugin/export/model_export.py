@@ -96,6 +96,8 @@ def export_run(
     if scene is not None and max_gaussians is not None and max_gaussians < len(whole):
         kept = pruned(whole, contributions(whole, scene.train.cameras, model.config.raster), max_gaussians)
         notes = (f"the {len(kept)} of {len(whole)} Gaussians that add most to the training views",)
+    if model.antialiased and (is_page or not EXPORTS[file_format].marked):
+        notes += ("of antialiased training, which this file does not say: viewers draw it thicker",)
     if is_page and scene is not None:
         written = page_gaussians(kept, scene.train.cameras, model.sh_degree)
     else:
@@ -109,8 +111,6 @@ def export_run(
             notes += (f"about the local origin {' '.join(f'{value:.12g}' for value in origin)}",)
         if form.suffix == "spz":
             notes += (f"version {VERSION}; older viewers need --format spz2" if file_format == "spz" else "version 2",)
-        if model.antialiased and not form.marked:
-            notes += ("of antialiased training, which this file does not say",)
         form.write(kept, file, frame, model.iteration or 0, model.antialiased)
         written = kept if form.read is None else Similarity.into(frame).apply(form.read(file)).map(torch.Tensor.float)
     lost = f"not measured: {absent or 'the capture has no test views'}"

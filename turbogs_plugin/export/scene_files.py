@@ -9,6 +9,7 @@ import json
 import math
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,7 +48,9 @@ def save_glb(gaussians: Gaussians, path: Path, frame: Frame) -> None:
     for band in range(model.shN.shape[1]):
         degree = math.isqrt(band + 1)
         columns[f"{GLTF}:SH_DEGREE_{degree}_COEF_{band + 1 - degree**2}"] = model.shN[:, band]
-    views, accessors, parts, start = [], [], [], 0
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    parts, start = [], 0
     for column in columns.values():
         parts.append(column.numpy().astype("<f4").tobytes())
         views.append({"buffer": 0, "byteOffset": start, "byteLength": len(parts[-1]), "target": VERTICES})

@@ -20,20 +20,9 @@ BANDS = (0, 3, 8, 15)
 
 
 def save_gsplat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0) -> None:
-    """Write a model as gsplat's trainer does, in the capture's own coordinates. The file is written whole or not.
-
-    Args:
-        gaussians: the model. Gaussians that are not finite are left out, with a warning that counts them.
-        path: the file to write; its folder must exist.
-        frame: of the model's coordinates.
-        step: iterations of its training.
-
-    Raises:
-        InputError: nothing to write.
-        OSError: from the disk.
-    """
-    splats = dict(in_capture(gaussians, frame, path).items())
-    save_plain(path, {"step": step, "splats": splats})
+    """Write a model as gsplat's trainer does, whole or not at all, in the capture's own coordinates. Arguments and
+    errors as of `in_capture`; `step`: iterations of its training."""
+    save_plain(path, {"step": step, "splats": dict(in_capture(gaussians, frame, path).items())})
 
 
 def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:

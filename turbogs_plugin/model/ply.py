@@ -28,21 +28,15 @@ ANTIALIASED = re.compile(rb"^comment\s+(splatrendermode:\s*mip|antialiased\W+(1|
 
 
 def save_ply(gaussians: Gaussians, path: str | Path, frame: Frame | None = None, antialiased: bool = False) -> None:
-    """Write a model as a .ply with the properties of the original 3DGS, normals (zero) included.
+    """Write a model as a .ply with the properties of the original 3DGS, normals (zero) included, whole or not at all.
+    Arguments and errors as of `in_capture`.
 
     All properties are float, as viewers expect. Only x, y and z are double, if the capture lies so far from the origin
-    that float would round positions by more than 1e-6 of its extent (UTM metres). The file is written whole or not at
-    all.
+    that float would round positions by more than 1e-6 of its extent (UTM metres).
 
     Args:
-        gaussians: the model. Gaussians that are not finite are left out, with a warning that counts them.
-        path: the file to write; its folder must exist.
-        frame: if given, the model is written in the capture's own coordinates.
+        frame: None for a model in the capture's own coordinates.
         antialiased: how the model is drawn, which a comment says in Brush's words.
-
-    Raises:
-        InputError: there is nothing to write.
-        OSError: from the disk.
     """
     path, frame = Path(path), frame or Frame(np.zeros(3), 1.0)
     rows = in_capture(gaussians, frame, path, double_means=True)

@@ -94,9 +94,7 @@ def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaus
         InputError: no Gaussian is finite.
     """
     if count := int((flat := gaussians.scales == -math.inf).any(dim=1).sum()):
-        warnings.warn(
-            f"{source}: {count} Gaussians are flat (a scale of 0, as of 2DGS): they are drawn thin", stacklevel=3
-        )
+        warnings.warn(f"{source}: {count} Gaussians are flat (scale 0, as of 2DGS) and drawn thin", stacklevel=3)
     opacities = gaussians.opacities.where(~gaussians.opacities.isinf(), OPAQUE * gaussians.opacities.sign())
     gaussians = replace(gaussians, opacities=opacities, scales=gaussians.scales.masked_fill(flat, FLAT))
     rows = change.apply(gaussians).map(lambda value: value.float().contiguous())
@@ -124,12 +122,9 @@ def in_capture(gaussians: Gaussians, frame: Frame, target: Path, double_means: b
 def upright(gaussians: Gaussians) -> Gaussians:
     """A model in axes x right, y up, z backward in those x right, y down, z forward of captures, and back: y and z
     change their sign in everything that depends on a direction."""
-    signs = gaussians.means.new_tensor([1.0, -1.0, -1.0])
-    direction = torch.tensor([[0.3, 0.5, 0.8124038404635961]], dtype=torch.float64)
-    values = (basis(each, gaussians.sh_degree)[0] for each in (direction, direction * signs.cpu()))  # [B] each
-    flips = torch.sign(torch.mul(*values)).to(gaussians.shN)  # each function is even or odd in y and z together
-    quats, shN = gaussians.quats * torch.cat([signs[:1], signs]), gaussians.shN * flips[:, None]
-    return replace(gaussians, means=gaussians.means * signs, quats=quats, shN=shN)
+    signs = gaussians.means.new_tensor([1.0, 1.0, -1.0, -1.0])
+    shN = _turned_harmonics(gaussians.shN, np.diag(signs[1:].cpu().numpy()))
+    return replace(gaussians, means=gaussians.means * signs[1:], quats=gaussians.quats * signs, shN=shN)
 
 
 def local_origin(frame: Frame) -> np.ndarray:
@@ -178,7 +173,7 @@ def _turned_harmonics(shN: Tensor, rotation: np.ndarray) -> Tensor:
     directions = torch.randn(SAMPLED_DIRECTIONS, 3, generator=generator, dtype=torch.float64)
     directions = torch.nn.functional.normalize(directions, dim=1)
     before = basis(directions, degree)  # [R, B]
-    after = basis(directions @ torch.from_numpy(rotation).T, degree)  # [R, B]
+    after = basis(directions @ torch.from_numpy(rotation).double().T, degree)  # [R, B]
     parts = []
     for of in range(1, degree + 1):
         rows = slice(num_bands(of - 1), num_bands(of))

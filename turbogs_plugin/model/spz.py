@@ -62,7 +62,6 @@ def save_spz(
     if bits < 0:
         raise InputError(f"positions of {largest:.3g} units do not fit into a .spz: export with --format ply")
     fixed = np.rint(values["means"] * 2.0**bits).astype("<i4")  # [N, 3]
-    opacities = 1.0 / (1.0 + np.exp(-values["opacities"]))
     quats = values["quats"][:, [1, 2, 3, 0]]
     quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
     positive = np.where(quats[:, 3:] < 0, -quats, quats)[:, :3]
@@ -70,7 +69,7 @@ def save_spz(
     parts = [
         HEADER.pack(MAGIC, version, len(gaussians), gaussians.sh_degree, bits, ANTIALIASED * antialiased, 0),
         fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes(),
-        _bytes(opacities * 255.0),
+        _bytes(255.0 / (1.0 + np.exp(-values["opacities"]))),
         _bytes(values["sh0"][:, 0] * (COLOR_SCALE * 255.0) + 127.5),
         _bytes((values["scales"] + 10.0) * 16.0),
         rotations,
@@ -133,9 +132,7 @@ def _unpacked(path: Path) -> tuple[int, int, list[np.ndarray]]:
         content = path.read_bytes()
         unpacker, (magic, version, count, degree, bits, flags, streams) = _header(content)
         if magic != MAGIC or version not in ((1, 2, 3) if unpacker else (4,)) or degree > 3 or not count:
-            raise InputError(
-                f"{path} is no .spz of version 1 .. 4 with Gaussians of degree 3 or less: convert what it was made of"
-            )
+            raise InputError(f"{path} is no .spz of version 1 .. 4 and degree 0 .. 3: convert what it was made of")
         widths = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1))
         size = count * sum(widths)
         if too_large(size):
@@ -147,15 +144,12 @@ def _unpacked(path: Path) -> tuple[int, int, list[np.ndarray]]:
             body = _of_streams(content, streams, [count * width for width in widths if width])
             whole = len(body) == size
     except ImportError:
-        raise InputError(
-            f"{path} is of version 4, which needs zstandard: pip install zstandard, or convert it by "
-            f"npx @playcanvas/splat-transform {path} model.ply"
-        ) from None
+        raise InputError(f"{path} is of version 4, which needs zstandard: pip install zstandard") from None
     except (OSError, zlib.error, struct.error) as error:
         raise InputError(f"cannot read {path} as .spz of version {version}: {error}; export it again") from None
     if not whole:
         raise InputError(
-            f"{path}, of version {version}, does not hold the {count} Gaussians that it announces: export it again"
+            f"{path} of version {version} lacks some of the {count} Gaussians it announces: export it again"
         )
     arrays = np.split(np.frombuffer(body, dtype=np.uint8, count=size), count * np.cumsum(widths[:-1]))
     return version, bits, [array.reshape(count, width) for array, width in zip(arrays, widths, strict=True)]

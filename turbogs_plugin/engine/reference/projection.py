@@ -65,8 +65,7 @@ class Splats(Projected):
 
     Args:
         colors: [R, 3] after the clamp at 0.
-        shares: [R] of an opacity that antialiasing leaves (Yu et al. 2024, "Mip-Splatting"): what the splat covers
-            without `eps2d` over what it covers.
+        shares: [R] of the opacity that antialiasing leaves: the splat's area without `eps2d` over its area with it.
     """
 
     colors: Tensor
@@ -154,8 +153,7 @@ def project_rows(
     variance_x, variance_y, covariance = (u * u).sum(dim=-1), (v * v).sum(dim=-1), (u * v).sum(dim=-1)
     # Lagrange's identity gives the determinant as a sum of squares: no cancellation, however thin the splat.
     cross = torch.linalg.cross(u, v)
-    sharp = (cross * cross).sum(dim=-1)
-    determinant = sharp + settings.eps2d * (variance_x + variance_y + settings.eps2d)
+    determinant = (cross * cross).sum(dim=-1) + settings.eps2d * (variance_x + variance_y + settings.eps2d)
     variance_x, variance_y = variance_x + settings.eps2d, variance_y + settings.eps2d
     conics = torch.stack([variance_y, -covariance, variance_x], dim=-1) / determinant[:, None]
 
@@ -170,5 +168,5 @@ def project_rows(
         radii = torch.ceil(extents[:, None] * variances.sqrt())
         drawn = ((means2d + radii > 0) & (means2d - radii < image)).all(dim=-1) & (radii > 0).any(dim=-1)
         radii = torch.where(drawn[:, None], radii, 0).to(torch.int32)
-        shares = (sharp / determinant).sqrt()
+        shares = ((cross * cross).sum(dim=-1) / determinant).sqrt()
     return Splats(means2d, conics, depths, opacities, radii, colors, shares)
