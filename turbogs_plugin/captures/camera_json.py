@@ -22,18 +22,13 @@ BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RA
 FISHEYE = "OPENCV_FISHEYE"
 
 
-def read_json(source: Path) -> Any:
-    """The value in a file of JSON. Raises `InputError` where it is none."""
+def read_frames(source: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """A transforms file, and its frames. Raises `InputError` unless it is JSON with a list of frames."""
     try:
         text = source.read_text(encoding="utf-8-sig")  # Windows' editors write a mark at its beginning
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {source} ({str(error)[:200]}): export or copy it again") from error
-    return parse_json(text, str(source))
-
-
-def read_frames(source: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """A transforms file, and its frames. Raises `InputError` unless it is JSON with a list of frames."""
-    content = read_json(source)
+    content = parse_json(text, str(source))
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{source} has no list of frames: export it again")

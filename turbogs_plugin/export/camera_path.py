@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from turbogs_plugin.captures.camera_json import number_of, opengl_viewmat, pinhole, read_frames, read_json
+from turbogs_plugin.captures.camera_json import number_of, opengl_viewmat, pinhole, read_frames
 from turbogs_plugin.captures.capture import LARGEST_SIDE
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.placement import out_of_nerfstudio
+from turbogs_plugin.model.placement import out_of_nerfstudio, read_json
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.geometry import camera_centers, evenly, look_at
 from turbogs_plugin.types import Cameras
@@ -21,6 +21,8 @@ MOST_KEYS = 24
 """Largest number of a capture's cameras that a path goes through, evenly spread: more would make it jitter."""
 MOST_POINTS = 1000
 """Points of a capture that tell in which of nerfstudio's worlds a path is."""
+LENS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
+"""Keys of a lens in a ``transforms.json``, of a frame or of all."""
 SWING = math.pi
 """Largest gap in radians between cameras that surround what they look at; beyond it an orbit swings."""
 WIDEST_FILM = 1920
@@ -101,7 +103,7 @@ def from_file(path: Path, scene: Scene, frames: int) -> Cameras:
         lenses, poses = _of_nerfstudio(content, path)
     else:
         content, entries = read_frames(path)
-        lenses = [content | entry for entry in entries]
+        lenses = [{key: each[key] for each in (content, entry) for key in LENS if key in each} for entry in entries]
         poses = [entry.get("transform_matrix") for entry in entries]
     Ks: list[np.ndarray] = []
     size: tuple[int, int] | None = None

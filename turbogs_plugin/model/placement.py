@@ -8,13 +8,15 @@ into the folder of the training: ``new = scale * (transform @ old)``. Its old co
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from turbogs_plugin.captures.camera_json import read_json
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import read_text
 from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.types import SH_C0, Gaussians
+from turbogs_plugin.yaml_json import parse_json
 
 TRANSFORMS = "dataparser_transforms.json"
 TURNS = tuple(np.array(turn, dtype=np.float64) for turn in (
@@ -60,6 +62,11 @@ def nearest_change(
         distances, _ = cKDTree(np.concatenate([places, rows[:, 3:]], axis=1)).query(wanted)
         apart.append(float(np.median(distances)))  # passes over lone points; infinite without Gaussians
     return changes[int(np.argmin(apart))], min(apart)
+
+
+def read_json(source: Path) -> Any:
+    """The value in a file of JSON. Raises `InputError` where it is none."""
+    return parse_json((read_text(source) or "").removeprefix("\ufeff"), str(source))  # a mark of Windows' editors
 
 
 def out_of_nerfstudio(file: Path) -> list[Similarity]:

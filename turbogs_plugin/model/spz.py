@@ -43,6 +43,11 @@ way all became 0."""
 LARGEST_COMPONENT = 511
 """Largest code of each of a quaternion's three stored components: 9 bits and a sign, for 0 .. 1 / sqrt(2)."""
 GZIP_LEVEL = 6
+MOST_UNPACKED, ALWAYS_UNPACKED = 16, 2**20
+"""Most bytes that a byte of the file may unpack to, and bytes that any file may: positions alone, nine of a Gaussian's
+20 to 65 bytes, hardly pack."""
+READING = 2 * 8 * 59
+"""Bytes that a Gaussian takes while it is read: two copies of its numbers in float64."""
 
 
 def save_spz(
@@ -89,7 +94,8 @@ def read_spz(path: Path) -> Gaussians:
     """A model in x right, y down, z forward; float64, on the CPU.
 
     Raises:
-        InputError: the file is not a whole one of this format, or of version 4 where zstandard is not installed.
+        InputError: the file is not a whole one of this format, of version 4 where zstandard is not installed, or
+            unpacks to more than `MOST_UNPACKED` times its bytes, or than the memory takes.
     """
     version, bits, (means, opacities, colors, scales, rotations, harmonics) = _unpacked(path)
     count = len(opacities)
@@ -135,7 +141,11 @@ def _unpacked(path: Path) -> tuple[int, int, list[np.ndarray]]:
             raise InputError(f"{path} is no .spz of version 1 .. 4 and degree 0 .. 3: convert what it was made of")
         widths = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1))
         size = count * sum(widths)
-        if too_large(size):
+        if size > max(ALWAYS_UNPACKED, MOST_UNPACKED * len(content)):
+            raise InputError(
+                f"{path} announces {count} Gaussians in {len(content)} bytes: it is damaged, export it again"
+            )
+        if too_large(READING * count):
             raise InputError(f"{path} announces {count} Gaussians, more than fit in the free memory: export it again")
         if unpacker:
             body = unpacker.decompress(unpacker.unconsumed_tail, size + 1)
