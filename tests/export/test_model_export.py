@@ -17,7 +17,7 @@ from turbogs_plugin.export import renders
 from turbogs_plugin.export.model_export import EXPORTS, contributions, pruned
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.model.ply import load_ply, save_ply
-from turbogs_plugin.train.saved_model import load_given, load_model
+from turbogs_plugin.train.saved_model import is_antialiased, load_given, load_model
 from turbogs_plugin.types import SH_C0, WHITE
 
 LOSSY = ("spz", "spz2", "splat")
@@ -59,6 +59,18 @@ def test_a_capture_far_from_its_origin_is_exported_about_another(turbogs, finish
     assert abs(before - after) < (1 if name in LOSSY else 0.01)
     if name in FORMATS:
         assert (load_given(file, load_scene(moved)).means - load_ply(far, frame).means).abs().max() < 1e-3
+
+
+@pytest.mark.parametrize(("name", "marked"), [("spz", True), ("ply", True), ("glb", False)])
+def test_a_file_says_that_its_model_is_antialiased_or_the_export_does(
+    turbogs, finished, capture, tmp_path, name, marked
+):
+    model, file = load_model(finished, torch.device("cpu")), tmp_path / f"m.{name}"
+    save_ply(model.gaussians, tmp_path / "a.ply", model.frame, antialiased=True)
+    code, out, err = turbogs("export", tmp_path / "a.ply", "--scene", capture, "--format", name, "--out", file)
+    before, after = map(float, re.search(r"PSNR   ([\d.]+) -> ([\d.]+) dB", out).groups())
+    assert code == 0 and marked == ("antialiased" not in out) and (marked or before - after > 0.01), (out, err)
+    assert not marked or is_antialiased(file)
 
 
 def test_a_given_model_has_the_background_of_its_photos(capture):

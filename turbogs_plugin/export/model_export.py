@@ -96,7 +96,7 @@ def export_run(
     if scene is not None and max_gaussians is not None and max_gaussians < len(whole):
         kept = pruned(whole, contributions(whole, scene.train.cameras, model.config.raster), max_gaussians)
         notes = (f"the {len(kept)} of {len(whole)} Gaussians that add most to the training views",)
-    if model.antialiased and (is_page or not EXPORTS[file_format].marked):
+    if unmarked := model.antialiased and (is_page or not EXPORTS[file_format].marked):
         notes += ("of antialiased training, which this file does not say: viewers draw it thicker",)
     if is_page and scene is not None:
         written = page_gaussians(kept, scene.train.cameras, model.sh_degree)
@@ -118,8 +118,12 @@ def export_run(
     if scene is not None and len(scene.test):
         test, chosen = place_views(scene.test, whole.device, "host"), evenly(len(scene.test), MOST_VIEWS)
         look, to_device = model.own_look(test), partial(torch.Tensor.to, device=whole.device)
-        shown = [(each, min(look.sh_degree, each.sh_degree)) for each in (whole, written.map(to_device))]
-        errors = [evaluate(each, test, replace(look, sh_degree=degree), view_ids=chosen) for each, degree in shown]
+        plain = replace(look, antialiased=look.antialiased and not unmarked)
+        shown = [
+            (whole, look),
+            (written.map(to_device), replace(plain, sh_degree=min(look.sh_degree, written.sh_degree))),
+        ]
+        errors = [evaluate(each, test, seen, view_ids=chosen) for each, seen in shown]
         before, after = (each.mean.psnr for each in errors)
         lost = f"{before:.3f} -> {after:.3f} dB on {len(chosen)} of {len(test)} test views"
         caption += f": PSNR {after:.2f} dB on test views, {before:.2f} dB in the trained model"

@@ -87,8 +87,9 @@ def read_ply(path: str | Path) -> Gaussians:
         )
     if missing:
         raise InputError(
-            f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}, as a mesh, a "
-            "cloud of points or a compressed .ply does: give the .ply that a 3DGS trainer exports"
+            f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}, as a mesh or a cloud of "
+            "points does: give the .ply that a 3DGS trainer exports, or of a compressed .ply what  npx "
+            "@playcanvas/splat-transform  makes of it"
         )
     count = len(vertices["x"])
     if not count:
