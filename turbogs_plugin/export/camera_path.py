@@ -123,8 +123,8 @@ def from_file(path: Path, scene: Scene, frames: int) -> Cameras:
     )
     if isinstance(content, dict) and "camera_path" in content and (changes := out_of_nerfstudio(path)):
         points = scene.frame.restore_points(scene.points[evenly(len(scene.points), MOST_POINTS)].cpu().numpy())
-        moved = [change.apply_to_poses(viewmats) for change in changes]
-        viewmats = max(moved, key=lambda each: _seen(each, np.stack(Ks), points))
+        moved, some = [change.apply_to_poses(viewmats) for change in changes], evenly(len(viewmats), MOST_KEYS)
+        viewmats = max(moved, key=lambda each: _seen(each[some], np.stack(Ks)[some], points))
     return interpolated(scene.frame.normalise_poses(viewmats), np.stack(Ks), size, frames)
 
 

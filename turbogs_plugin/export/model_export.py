@@ -36,6 +36,9 @@ from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.saved_model import load_with_capture
 from turbogs_plugin.types import Cameras, Gaussians
 
+PAGE = "html"
+"""Name of the page with the model to turn, which no program reads back."""
+
 
 class Export(NamedTuple):
     """A format of exported files: its suffix, how it is written (as `Format.write`) and read again, None where every
@@ -53,10 +56,9 @@ EXPORTS = {
     "splat": Export("splat", lambda model, path, frame, step, mip: save_splat(model, path, frame), read_splat),
     "glb": Export("glb", lambda model, path, frame, step, mip: save_glb(model, path, frame)),
     "usda": Export("usda", lambda model, path, frame, step, mip: save_usda(model, path, frame)),
+    PAGE: Export(PAGE, lambda *_: None),  # of another source than a model alone
 }
 """Name, as on the command line -> the format."""
-PAGE = "html"
-"""Name of the page with the model to turn, which no program reads back."""
 MOST_ON_PAGE = 800_000
 """Largest model of a page: 36 bytes a Gaussian make about 30 MB, which mail and chat programs take."""
 MOST_VIEWS = 8
@@ -88,7 +90,7 @@ def export_run(
     file = out
     if file is None:
         assert model.folder is not None, "only a run is exported without --out"
-        file = model.folder.model.with_suffix(f".{_suffix(file_format)}")
+        file = model.folder.model.with_suffix(f".{EXPORTS[file_format].suffix}")
     if is_page:
         max_gaussians = min(max_gaussians or MOST_ON_PAGE, MOST_ON_PAGE)
     kept, whole = model.gaussians, model.gaussians
@@ -96,7 +98,7 @@ def export_run(
     if scene is not None and max_gaussians is not None and max_gaussians < len(whole):
         kept = pruned(whole, contributions(whole, scene.train.cameras, model.config.raster), max_gaussians)
         notes = (f"the {len(kept)} of {len(whole)} Gaussians that add most to the training views",)
-    if unmarked := model.antialiased and (is_page or not EXPORTS[file_format].marked):
+    if unmarked := model.antialiased and not EXPORTS[file_format].marked:
         notes += ("of antialiased training, which this file does not say: viewers draw it thicker",)
     if is_page and scene is not None:
         written = page_gaussians(kept, scene.train.cameras, model.sh_degree)
@@ -140,23 +142,18 @@ def _require_options(
     path: Path, file_format: str, out: Path | None, max_gaussians: int | None, given: Config | None
 ) -> None:
     """Raise `InputError` where options do not fit each other, before anything is loaded."""
-    if file_format not in (*EXPORTS, PAGE):
-        known = ", ".join((*EXPORTS, PAGE))
-        raise InputError(f"--format {file_format}: there is no such format; choose one of {known}")
+    if file_format not in EXPORTS:
+        raise InputError(f"--format {file_format}: there is no such format; choose one of {', '.join(EXPORTS)}")
     if max_gaussians is not None and max_gaussians < 1:
         raise InputError(f"--max-gaussians {max_gaussians}: it must be at least 1")
     if out is not None:
         require_new_file(out, "--out")
-        if out.suffix.lower() != f".{_suffix(file_format)}":
-            raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in .{_suffix(file_format)}")
+        if out.suffix.lower() != (suffix := f".{EXPORTS[file_format].suffix}"):
+            raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in {suffix}")
     elif given is not None:
         raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
     elif max_gaussians is not None and file_format == "ply":
         raise InputError("--max-gaussians would replace the run's own model.ply: name a new file by --out")
-
-
-def _suffix(file_format: str) -> str:
-    return PAGE if file_format == PAGE else EXPORTS[file_format].suffix
 
 
 @torch.no_grad()

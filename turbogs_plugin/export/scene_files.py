@@ -5,6 +5,7 @@ All numbers are float32, as trained; axes are x right, y up, z backward.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import struct
@@ -21,8 +22,8 @@ from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.types import SH_C0, Gaussians
 
 GLTF = "KHR_gaussian_splatting"
-FLOAT, VERTICES, POINTS = 5126, 34962, 0
-"""glTF's numbers for float32, for a buffer of vertices, and for primitives that are points."""
+FLOAT, VERTICES, POINTS, TYPES = 5126, 34962, 0, {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+"""glTF's numbers for float32, for a buffer of vertices, and for primitives that are points; its vectors."""
 LARGEST_GLB = 2**32 - 1
 ROWS_AT_ONCE = 10_000
 """Rows of numbers that become text at a time."""
@@ -48,38 +49,37 @@ def save_glb(gaussians: Gaussians, path: Path, frame: Frame) -> None:
     for band in range(model.shN.shape[1]):
         degree = math.isqrt(band + 1)
         columns[f"{GLTF}:SH_DEGREE_{degree}_COEF_{band + 1 - degree**2}"] = model.shN[:, band]
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-    parts, start = [], 0
-    for column in columns.values():
-        parts.append(column.numpy().astype("<f4").tobytes())
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": len(parts[-1]), "target": VERTICES})
-        kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[column.shape[1]]
-        accessors.append({"bufferView": len(accessors), "componentType": FLOAT, "count": len(model), "type": kind})
-        start += len(parts[-1])
+    parts = [column.numpy().astype("<f4").tobytes() for column in columns.values()]
+    starts = [0, *itertools.accumulate(map(len, parts))]
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": place, "componentType": FLOAT, "count": len(model), "type": TYPES[column.shape[1]]}
+        for place, column in enumerate(columns.values())
+    ]
     accessors[0] |= {"min": model.means.amin(dim=0).tolist(), "max": model.means.amax(dim=0).tolist()}
     primitive = {
-        "attributes": {name: number for number, name in enumerate(columns)},
+        "attributes": {name: place for place, name in enumerate(columns)},
         "mode": POINTS,
         "extensions": {GLTF: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }
     content = {
         "asset": {"version": "2.0", "generator": "TurboGS"},
         "extensionsUsed": [GLTF],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [primitive]}],
-        "buffers": [{"byteLength": start}],
-        "bufferViews": views,
+        "buffers": [{"byteLength": starts[-1]}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": len(part), "target": VERTICES}
+            for start, part in zip(starts, parts, strict=False)
+        ],
         "accessors": accessors,
-    }
+    } | {"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
     text = json.dumps(content).encode()
     text += b" " * (-len(text) % 4)
-    size = 12 + 8 + len(text) + 8 + start
+    size = 12 + 8 + len(text) + 8 + starts[-1]
     if size > LARGEST_GLB:
         raise InputError(f"{path} would have {size} bytes, more than a .glb can: export fewer by --max-gaussians")
-    head = struct.pack("<4sIII4s", b"glTF", 2, size, len(text), b"JSON") + text + struct.pack("<I4s", start, b"BIN\0")
+    head = (
+        struct.pack("<4sIII4s", b"glTF", 2, size, len(text), b"JSON") + text + struct.pack("<I4s", starts[-1], b"BIN\0")
+    )
     write_atomically(path, lambda file: file.writelines([head, *parts]))
 
 
