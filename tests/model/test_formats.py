@@ -3,6 +3,7 @@
 import gzip
 import itertools
 import struct
+import sys
 from contextlib import nullcontext
 
 import numpy as np
@@ -137,6 +138,13 @@ def test_every_version_of_spz_is_read(tmp_path, number, flags, tail):
     file.write_bytes(file.read_bytes()[: -file.stat().st_size // 3])
     with pytest.raises(InputError, match=f"version {number}"):
         FORMATS["spz"].read(file)
+
+
+def test_version_4_without_its_unpacker_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    (tmp_path / "m").write_bytes(struct.pack("<IIIBBBBI12x", 0x5053474E, 4, 2, 0, 12, 0, 5, 32) + b"\0" * 90)
+    with pytest.raises(InputError, match="version 4, which needs zstandard: pip install zstandard"):
+        FORMATS["spz"].read(tmp_path / "m")
 
 
 def test_the_older_spz_is_read_back(tmp_path):

@@ -20,13 +20,14 @@ from turbogs_plugin.commands.options import GivenOptions
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.model import placement
 from turbogs_plugin.model.gsplat_world import gsplat_worlds
 from turbogs_plugin.model.placement import TRANSFORMS, TURNS
 from turbogs_plugin.model.ply import read_ply, save_ply
 from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.model.spz import save_spz
 from turbogs_plugin.scene import Frame
-from turbogs_plugin.train import run, saved_model
+from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.saved_model import load_given, load_model
 from turbogs_plugin.train.trainer import Trainer
@@ -155,8 +156,8 @@ def test_nerfstudios_file_beside_a_model_brings_it_back(finished, capture, tmp_p
 
 
 def test_a_model_in_other_coordinates_is_said_not_to_fit(finished, capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(saved_model, "FEWEST_POINTS", 50)
-    monkeypatch.setattr(saved_model, "FARTHEST_POINTS", 0.3)  # of a tiny capture, whose points lie far apart
+    monkeypatch.setattr(placement, "FEWEST_POINTS", 50)
+    monkeypatch.setattr(placement, "FARTHEST_POINTS", 0.3)  # of a tiny capture, whose points lie far apart
     change = Similarity(Rotation.from_euler("x", 0.7).as_matrix(), 0.31, np.array([0.1, -0.2, 0.3]))
     file = save_splats(tmp_path / "a.pt", change.apply(read_ply(finished / "model.ply")))
     with pytest.warns(UserWarning, match="does not fit the points"):

@@ -53,10 +53,6 @@ _FOLDERS = (
     "ply/*.ply",
 )
 """Models in folders of trainings: of TurboGS, Inria's 3DGS and gsplat."""
-FARTHEST_POINTS, FEWEST_POINTS = 0.2, 1000
-"""`nearest_change` beyond which a model does not fit its capture. In five captures a model of half the points, its
-colours off by 0.08, has 0.06 to 0.08 beside the other half, and 0.13 to 1.4 turned or scaled about its middle. Fewer
-points lie too far apart to tell."""
 
 
 @dataclass
@@ -212,8 +208,8 @@ def _to_capture(gaussians: Gaussians, path: Path, scene: Scene, world: str) -> S
         changes += [Similarity(turn, 1.0, np.array(origin)) for turn in turns for origin in origins]
     if scene.drawn_points:
         return changes[0]
-    change, apart = nearest_change(gaussians, changes, points, scene.point_colors.cpu().numpy())
-    if len(points) >= FEWEST_POINTS and apart > FARTHEST_POINTS:
+    change, fits = nearest_change(gaussians, changes, points, scene.point_colors.cpu().numpy())
+    if not fits:
         warnings.warn(
             f"{path} does not fit the points of {scene.name}: it is of another capture or in other coordinates; say "
             f"train.init_world=gsplat for gsplat's normalised ones, or put nerfstudio's {TRANSFORMS} beside it",
