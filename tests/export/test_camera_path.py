@@ -79,47 +79,28 @@ def scene_of(frame: Frame) -> SimpleNamespace:
 WORLD = Similarity(Rotation.from_euler("xyz", (0.4, -1.1, 0.2)).as_matrix(), 0.3, np.array([0.1, -0.2, 0.3]))
 
 
-def layouts(viewmats: np.ndarray) -> dict[str, object]:
+def written(layout: str, viewmats: np.ndarray) -> object:
     """Cameras of 64x48 pixels, with focal lengths of 100 and 50 pixels, as programs write them."""
-    poses = [np.linalg.inv(viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0]) for viewmat in viewmats]  # OpenGL's axes
-    focal = (100.0, 50.0)
-    seen = {
-        "w": 64,
-        "h": 48,
-        "frames": [{"transform_matrix": p.tolist(), "fl_x": f} for p, f in zip(poses, focal, strict=True)],
-    }
-    sized = {
-        "frames": [
-            {"w": 64 * k, "h": 48 * k, "fl_x": f * k, "transform_matrix": p.tolist()}
-            for p, f, k in zip(poses, focal, (1, 2), strict=True)
-        ]
-    }
-    inria = [
-        {
-            "width": 64,
-            "height": 48,
-            "fx": f,
-            "fy": f,
-            "position": p[:3, 3].tolist(),
-            "rotation": (p[:3, :3] * [1, -1, -1]).tolist(),
-        }
-        for p, f in zip(poses, focal, strict=True)
-    ]
-    studio = {
-        "render_width": 64,
-        "render_height": 48,
-        "camera_path": [
-            {"camera_to_world": p.ravel().tolist(), "fov": float(np.degrees(2 * np.arctan(24 / f)))}
-            for p, f in zip(poses, focal, strict=True)
-        ],
-    }
-    return {"transforms": seen, "sized": sized, "inria": inria, "nerfstudio": studio}
+    cameras, own = [], layout == "own sizes"
+    for viewmat, focal, k in zip(viewmats, (100.0, 50.0), (1, 2 if own else 1), strict=True):
+        pose = np.linalg.inv(viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes
+        place, axes = pose[:3, 3].tolist(), (pose[:3, :3] * [1, -1, -1]).tolist()
+        fov = float(np.degrees(2 * np.arctan(24 / focal)))
+        frame = {"transform_matrix": pose.tolist(), "fl_x": focal * k, **({"w": 64 * k, "h": 48 * k} if own else {})}
+        inria = {"width": 64, "height": 48, "fx": focal, "fy": focal, "position": place, "rotation": axes}
+        studio = {"camera_to_world": pose.ravel().tolist(), "fov": fov}
+        cameras.append({"Inria": inria, "nerfstudio": studio}.get(layout, frame))
+    if layout == "nerfstudio":
+        return {"render_width": 64, "render_height": 48, "camera_path": cameras}
+    return cameras if layout == "Inria" else {"frames": cameras, **({} if own else {"w": 64, "h": 48})}
 
 
 @pytest.mark.parametrize(
     ("layout", "turn"),
-    [(name, None) for name in ("transforms", "sized", "inria", "nerfstudio")]
-    + [("nerfstudio", turn) for turn in TURNS],
+    [
+        *((name, None) for name in ("one size", "own sizes", "Inria")),
+        *(("nerfstudio", turn) for turn in (None, *TURNS)),
+    ],
 )
 def test_a_file_of_cameras_is_in_the_captures_coordinates(tmp_path, layout, turn):
     """Or in nerfstudio's, whose file lies beside it."""
@@ -127,11 +108,10 @@ def test_a_file_of_cameras_is_in_the_captures_coordinates(tmp_path, layout, turn
     viewmats = ring(np.array([0.0, 0.5])).viewmats.double().numpy()
     given = viewmats
     if turn is not None:
-        (tmp_path / TRANSFORMS).write_text(
-            json.dumps({"transform": np.c_[WORLD.rotation, WORLD.translation / 0.3].tolist(), "scale": 0.3})
-        )
+        values = {"transform": np.c_[WORLD.rotation, WORLD.translation / 0.3].tolist(), "scale": 0.3}
+        (tmp_path / TRANSFORMS).write_text(json.dumps(values))
         given = WORLD.after(Similarity(turn, 1.0, np.zeros(3)).inverse()).apply_to_poses(viewmats)
-    (tmp_path / "a.json").write_text(json.dumps(layouts(given)[layout]))
+    (tmp_path / "a.json").write_text(json.dumps(written(layout, given)))
     made = from_file(tmp_path / "a.json", scene_of(frame), 5)
     assert np.allclose(made.viewmats[[0, -1]].numpy(), frame.normalise_poses(viewmats), atol=1e-4)
     assert made.sizes.tolist() == [[64, 48]] * 5
@@ -139,12 +119,7 @@ def test_a_file_of_cameras_is_in_the_captures_coordinates(tmp_path, layout, turn
 
 
 WRONG = ({"w": None}, {"w": 0}, {"fl_x": -1.0}, {"frames": []}, {"frames": [{}]}, {"frames": [{"transform_matrix": 1}]})
-WRONG += (
-    [{}],
-    [{"width": 9, "height": 9, "fx": 5, "rotation": [[1, 2], 3], "position": [1, 2, 3]}],
-    [1],
-    {"camera_path": []},
-)
+WRONG += ([{}], [1], [{"width": 9, "height": 9, "fx": 5, "rotation": [[1, 2], 3]}], {"camera_path": []})
 WRONG += ({"camera_path": [1], "render_width": 9, "render_height": 9}, {"camera_path": [{}], "camera_type": "fisheye"})
 
 
