@@ -29,12 +29,14 @@ import moment_lm
 import sparse_pixels
 import torch
 import tyro
+import whole_step
 from editing import edited
 
 HERE = Path(__file__).resolve().parent
 
 VARIANTS: dict[str, tuple[str, ...]] = {
     "stock": (),
+    "step": (whole_step.EDITS,),
     "density": (density.EDITS,),
     "errors": (density.EDITS, errors.EDITS),
     "lm": (density.EDITS, errors.EDITS, moment_lm.EDITS),
@@ -56,7 +58,7 @@ class Options:
         host: a copy of gsplat's repository, with examples/simple_trainer.py of 1.5.3 or main.
         scenes: folders with images/ and sparse/0/.
         out: folder of the results.
-        variants: some of stock, density, errors, lm, sparse, all.
+        variants: some of stock, step, density, errors, lm, sparse, all.
         steps: of each run.
         marks: steps after which it is evaluated, beside the last one.
         factor: the photos' own, by which they are smaller: images_4/ at 4.

@@ -15,6 +15,7 @@ from turbogs_plugin.gsplat_bridge.host import (
     GEOMETRY,
     GROUND_TRUTH,
     PREDICTION,
+    ROLES,
     STATISTICS,
     Optimizers,
     Parameters,
@@ -264,9 +265,11 @@ def apply_row_update(
     """
     count = len(params["means"])
     for name, parameter in [*params.items()]:
-        value = parameter[update.source]
-        if name in update.values:
-            value = update.values[name].reshape(value.shape)  # a host's own layout
+        role = ROLES.get(name, name)
+        if role in update.values:
+            value = update.values[role].reshape(-1, *parameter.shape[1:])  # a host's own layout
+        else:
+            value = parameter.detach()[update.source]
         replaced = torch.nn.Parameter(value, requires_grad=parameter.requires_grad)
         params[name] = replaced
         if name in optimizers:
@@ -274,7 +277,7 @@ def apply_row_update(
             rows = optimizer.state.pop(parameter, {})
             for key in rows.keys() - {COUNT}:
                 rows[key] = update.apply_state(rows[key])
-                if name in update.reset:
+                if role in update.reset:
                     rows[key].zero_()
             optimizer.state[replaced] = rows
             for group in optimizer.param_groups:

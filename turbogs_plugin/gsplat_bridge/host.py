@@ -35,6 +35,9 @@ LAYOUTS: dict[str, list[tuple[str | int, ...]]] = {
 """Shapes of each parameter, N Gaussians with B harmonics above band 0: gsplat's, then nerfstudio's splatfacto's, which
 is taken too."""
 
+ROLES = {"features_dc": "sh0", "features_rest": "shN"}
+"""Names that splatfacto has for gsplat's."""
+
 GEOMETRY = ("means", "quats", "scales", "opacities")
 
 
@@ -73,6 +76,7 @@ def host_gaussians(params: Mapping[str, Tensor] | Parameters, names: Iterable[st
         InputError: a parameter is missing, or has another shape than in gsplat's layout (opacities [N, 1] and sh0
             [N, 3] are taken, too), or another number of rows.
     """
+    params = {ROLES.get(name, name): value for name, value in params.items()}
     require_keys(params, names, "params", f"expected {', '.join(names)}")
     count = params["means"].shape[0]
     for name in [name for name in PARAMETER_NAMES if name in params]:

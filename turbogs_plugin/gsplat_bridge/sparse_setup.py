@@ -9,8 +9,9 @@ from typing import Any
 import torch
 
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.errors import require
 from turbogs_plugin.gsplat_bridge.density_swap import TUNED
+from turbogs_plugin.gsplat_bridge.host_views import masks_of, read_items
 from turbogs_plugin.strategies.schedule import SinusoidalSchedule
 from turbogs_plugin.types import SamplingBudget
 
@@ -62,28 +63,8 @@ def maps_of_photos(
         white: the largest value of a photo; gsplat's data sets have 255.
 
     Raises:
-        InputError: the data set cuts random patches (``patch_size``), whose pixels are others each time; or an image
-            is no tensor [H, W, 3].
+        InputError: as `read_items`.
     """
-    patch_size = getattr(trainset, "patch_size", None)
-    if patch_size is not None:
-        raise InputError(
-            f"the sparse swap needs whole images, trainset.patch_size is {patch_size}: leave patch_size out, as "
-            "samples are few pixels of a whole image already"
-        )
-    # Not iterated: a data set without __iter__ would be read past its end.
-    errors: list[torch.Tensor] = []
-    masks: list[torch.Tensor | None] = []
-    for number in range(len(trainset)):
-        item = trainset[number]
-        image = item["image"]
-        if not isinstance(image, torch.Tensor) or image.dim() != 3 or image.shape[-1] != 3:
-            found = tuple(image.shape) if isinstance(image, torch.Tensor) else type(image).__name__
-            raise InputError(f"trainset[{number}]['image'] is {found}: expected a tensor [H, W, 3], colours alone")
-        errors.append(image.to(device).float().sum(dim=-1) / white)  # [H, W]
-        masks.append(item.get("mask"))
-    if all(mask is None for mask in masks):
-        return ErrorMaps.from_images(errors)
-    whole = (torch.ones(image.shape, dtype=torch.bool) for image in errors)
-    counted = [every if mask is None else mask for every, mask in zip(whole, masks, strict=True)]
-    return ErrorMaps.from_images(errors, counted)
+    items = read_items(trainset, "trainset", white)
+    errors = [item["image"].to(device).float().sum(dim=-1) / 255.0 for item in items]  # [H, W] each
+    return ErrorMaps.from_images(errors, masks_of(items, "trainset"))

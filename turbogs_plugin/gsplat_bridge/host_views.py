@@ -1,0 +1,96 @@
+"""The photos of a gsplat trainer's data set, with what is refused by name."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.gsplat_bridge.host import require_keys
+from turbogs_plugin.masks import PixelMasks
+from turbogs_plugin.scene import Photos, PosedImages
+from turbogs_plugin.types import Cameras
+
+
+def read_items(trainset: Any, name: str, white: float) -> list[dict[str, Any]]:
+    """The items of a data set, by number, read by several threads: "image" [H, W, 3] uint8 and the other entries.
+
+    Args:
+        trainset: V items with "image" [H, W, 3], 0 .. `white`.
+        name: of the data set, for messages.
+
+    Raises:
+        InputError: it has no items by number, or cuts random patches (``patch_size``); or an image is no tensor
+            [H, W, 3], or not within 0 .. `white`.
+    """
+    if not (hasattr(trainset, "__len__") and hasattr(trainset, "__getitem__")) or not len(trainset):
+        raise InputError(f"{name} is a {type(trainset).__name__}: expected a data set with items by number, no loader")
+    if getattr(trainset, "patch_size", None) is not None:
+        raise InputError(
+            f"the sparse swap needs whole images, {name}.patch_size is {trainset.patch_size}: leave patch_size out, as "
+            "samples are few pixels of a whole image already"
+        )
+
+    def read(number: int) -> dict[str, Any]:
+        item, place = trainset[number], f"{name}[{number}]"
+        require_keys(
+            item if isinstance(item, dict) else {}, ("image",), place, "expected an item as gsplat's data sets"
+        )
+        image = item["image"]
+        if not isinstance(image, Tensor) or image.dim() != 3 or image.shape[-1] != 3:
+            found = tuple(image.shape) if isinstance(image, Tensor) else type(image).__name__
+            raise InputError(f"{place}['image'] is {found}: expected a tensor [H, W, 3], colours alone")
+        low, high = (float(value) for value in image.aminmax())
+        if not 0 <= low <= high <= white:
+            raise InputError(f"{place}['image'] has values {low:g} .. {high:g}: expected 0 .. {white:g}; see white")
+        scaled = image if image.dtype == torch.uint8 and white == 255 else (image * (255.0 / white)).round()
+        return {**item, "image": scaled.to(torch.uint8), "largest": high}
+
+    # Numbers, not iteration: a data set without __iter__ would be read past its end.
+    with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
+        items = list(pool.map(read, range(len(trainset))))
+    if white > 1 and max(item["largest"] for item in items) <= 1:
+        raise InputError(f"{name} has images within 0 .. 1, and white is {white:g}: pass white=1")
+    return items
+
+
+def posed_images(views: Any, white: float) -> PosedImages:
+    """The views of a data set whose items have "image", "K" [3, 3], "camtoworld" [4, 4] and perhaps "mask" [H, W]."""
+    items, cameras = read_items(views, "views", white), []
+    for number, item in enumerate(items):
+        place = f"views[{number}]"
+        require_keys(item, ("K", "camtoworld"), place, "expected items as in gsplat's data sets")
+        K, pose = (torch.as_tensor(item[key]).double().cpu() for key in ("K", "camtoworld"))
+        for key, value, side in (("K", K, 3), ("camtoworld", pose, 4)):
+            good = value.shape == (side, side) and bool(value.isfinite().all())
+            require(good, f"{place}['{key}']", value.tolist(), f"finite, [{side}, {side}]")
+        turned = (pose[:3, :3] @ pose[:3, :3].T - torch.eye(3)).abs().max() < 1e-3
+        require(bool(turned), f"{place}['camtoworld']", pose.tolist(), "a rotation and a place, without a scale")
+        cameras.append((torch.linalg.inv(pose), K))
+    sizes = np.array([item["image"].shape[1::-1] for item in items], dtype=np.int64)
+    Ks = torch.stack([K for _, K in cameras]).float()
+    masks = masks_of(items, "views")
+    return PosedImages(
+        Cameras(torch.stack([viewmat for viewmat, _ in cameras]).float(), Ks, sizes),
+        tuple(map(str, range(len(items)))),
+        Photos(torch.cat([item["image"].reshape(-1, 3).cpu() for item in items]), sizes),
+        None if masks is None else PixelMasks.from_images(masks),
+    )
+
+
+def masks_of(items: list[dict[str, Any]], name: str) -> list[Tensor] | None:
+    """[H, W] bool of each item, True where a pixel counts; None where no item has a "mask"."""
+    for number, item in enumerate(items):
+        mask, shape = item.get("mask"), tuple(item["image"].shape[:2])
+        if mask is not None and tuple(mask.shape) != shape:
+            raise InputError(f"{name}[{number}]['mask'] has shape {tuple(mask.shape)}: expected {shape} as its image")
+    whole = (torch.ones(item["image"].shape[:2], dtype=torch.bool) for item in items)
+    masks = [item.get("mask") for item in items]
+    if all(mask is None for mask in masks):
+        return None
+    return [every if mask is None else torch.as_tensor(mask).bool() for every, mask in zip(whole, masks, strict=True)]

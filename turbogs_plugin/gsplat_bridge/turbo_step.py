@@ -1,0 +1,347 @@
+"""The whole step of training in a gsplat trainer: which pixels, rendering, loss, update and density control are ours,
+everything around the step is the host's."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from gsplat.strategy import DefaultStrategy
+from torch import Tensor
+
+from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
+from turbogs_plugin.config.scaling import with_iterations
+from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.gsplat_bridge.density_swap import apply_row_update
+from turbogs_plugin.gsplat_bridge.host import (
+    ROLES,
+    Optimizers,
+    Parameters,
+    host_gaussians,
+    require_keys,
+    require_one_process,
+)
+from turbogs_plugin.gsplat_bridge.host_views import posed_images
+from turbogs_plugin.model.gsplat_file import BANDS
+from turbogs_plugin.model.initial import BACKDROP_COUNT
+from turbogs_plugin.model.limits import RESTRAIN_EVERY
+from turbogs_plugin.plan import SceneFacts, make_plan
+from turbogs_plugin.plan.decisions import wanted_iterations
+from turbogs_plugin.scene import Frame, PosedImages, Scene
+from turbogs_plugin.scene.photos import PhotoSamples
+from turbogs_plugin.strategies.learning_rates import LearningRates
+from turbogs_plugin.train.checkpoint import require_like
+from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, LossOutput, RowUpdate, Step
+
+_SWITCHES = (
+    "app_opt pose_opt pose_noise depth_loss use_bilateral_grid use_fused_bilagrid with_ut with_eval3d antialiased"
+)
+_SWITCHES += " antialiased random_bkgd sparse_grad visible_adam opacity_reg scale_reg"
+WITHOUT_EFFECT: dict[str, Any] = dict.fromkeys(_SWITCHES.split(), 0) | {
+    "post_processing": None,
+    "camera_model": "pinhole",
+    "batch_size": 1,
+}
+"""Options of gsplat's trainer that change its own step alone, and the value that asks for nothing."""
+
+
+@dataclass(frozen=True)
+class StepInfo:
+    """What a step gives. The host waits for a GPU where a number is read, and nowhere else.
+
+    Args:
+        loss: [] of the samples, before the step's update.
+        num_gaussians: after the step.
+        num_samples: pixels of the step, empty slots among them.
+    """
+
+    loss: Tensor
+    num_gaussians: int
+    num_samples: int
+    _colors: Tensor
+    _truth: PhotoSamples
+
+    @property
+    def psnr(self) -> float:
+        """PSNR of the samples in dB, before the step's update; to be read before the next step."""
+        filled = self._truth.samples.filled
+        return -10.0 * float((self._colors - self._truth.colors())[filled].square().mean().log10())
+
+
+class TurboStep:
+    """One training step after another on the parameters of a gsplat trainer, by Algorithm 1.
+
+    The host's parameters are the model: after a step, ``splats`` holds its present values under the host's names. Their
+    memory is shared, so what the host writes into them is trained on. Where a step changes the number of Gaussians,
+    ``splats`` gets new Parameters, as by gsplat's operations, and the `optimizers` are told.
+
+    The first step appends a backdrop of `BACKDROP_COUNT` Gaussians where all cameras look one way, and errors of all
+    views are measured. The last of `max_steps` steps ends with the mean of the last tenth.
+
+    Args:
+        splats: gsplat's parameters, float32: means [N, 3], scales [N, 3] (log), quats [N, 4], opacities [N] (logit),
+            sh0 [N, 1, 3], shN [N, B, 3]; or splatfacto's layout and names. More parameters of N rows may be there:
+            a new Gaussian takes its parent's row, one of the backdrop the first row.
+        views: V training photos, as gsplat's `Dataset` has them: items by number with "image" [H, W, 3], 0 .. `white`,
+            undistorted, "K" [3, 3], "camtoworld" [4, 4] and perhaps "mask" [H, W], True where a pixel counts. Sizes may
+            differ. All are read once, by several threads.
+        scene_scale: 1.1 times the largest distance of a camera from their mean; None: that is computed.
+        max_steps: length of the training; None: as many as `proposed_steps` says.
+        optimizers: the host's, by the names of the parameters. They are not stepped here.
+        rates: names of the parameters whose learning rate is the host's: the present ``lr`` of their optimizer.
+        options: the host's, as gsplat's `Config`: those that would have no effect here are refused, and its
+            `DefaultStrategy` is laid to rest (refine_stop_iter = 0).
+        scene: of gsplat from 1.6 on, a container with more arrays over Gaussians, whose rows follow.
+        white: largest value of a photo.
+        config: name of a packaged configuration, or a YAML file. overrides: ``section.key=value`` on top.
+
+    Attributes:
+        steps: how many are made. max_steps: of the training.
+
+    Raises:
+        InputError: several processes, an option or a parameter without support, or views of another form. All
+            randomness follows from ``torch.initial_seed()``.
+    """
+
+    def __init__(
+        self,
+        splats: Parameters,
+        views: Any,
+        scene_scale: float | None = None,
+        max_steps: int | None = None,
+        optimizers: Optimizers | None = None,
+        *,
+        rates: Collection[str] = (),
+        options: Any = None,
+        scene: Any = None,
+        white: float = 255.0,
+        config: str = DEFAULT_CONFIG,
+        overrides: Sequence[str] = (),
+    ) -> None:
+        require_one_process("TurboStep")
+        _require_options(options)
+        self.splats, self.optimizers, self.scene = splats, {} if optimizers is None else optimizers, scene
+        gaussians = self._checked()
+        device, degree = gaussians.device, gaussians.sh_degree
+        images = posed_images(views, white)
+        own = ("train.exposure=false", "train.init=points", f"train.sh_degree={degree}")
+        settings = load_config(config, (*overrides, *own))
+        if max_steps is not None:
+            require(max_steps >= 1, "max_steps", max_steps, "at least 1")
+            settings = with_iterations(settings, int(max_steps))
+        world = scene_of(images, gaussians, scene_scale)
+        settings = make_plan(settings, world, device).apply(settings)
+        settings.train.seed = torch.initial_seed() % 2**31
+        self.trainer = HostTrainer(self, settings, world, device)
+        if rates:
+            require_keys(self.optimizers, rates, "optimizers", "rates are of parameters whose optimizer is given")
+            if "learning_rates" not in settings.optimizer:
+                raise InputError(
+                    f"optimizer.type '{settings.optimizer['type']}' has no learning rates: leave out rates"
+                )
+            own_rates = self.trainer.optimizer.learning_rates = HostRates(**vars(self.trainer.optimizer.learning_rates))
+            own_rates.host = {ROLES.get(name, name): self.optimizers[name] for name in rates}
+        self.steps, self.max_steps, self._begun = 0, self.trainer.iterations, False
+
+    @staticmethod
+    def proposed_steps(num_views: int, config: str = DEFAULT_CONFIG, overrides: Sequence[str] = ()) -> int:
+        """The length that we propose for this number of training views."""
+        facts = SceneFacts(num_views, 0.0, 0, 0, "cpu", 0, 0)
+        return int(wanted_iterations(facts, load_config(config, overrides))[0])
+
+    def step(self, step: int) -> StepInfo:
+        """Make one step.
+
+        Args:
+            step: its number, from 0 on, or from `steps` on after `load_state_dict`.
+
+        Raises:
+            InputError: another number, or the host changed the number of Gaussians.
+        """
+        require_one_process("TurboStep")
+        if step != self.steps or step >= self.max_steps:
+            raise InputError(f"step is {step}: expected {self.steps}, the next one, below max_steps = {self.max_steps}")
+        trainer = self.trainer
+        self._begin() if not self._begun else self._take_changes()
+        while trainer.iteration <= step:  # iterations that had too little memory are made again
+            trainer.step()
+            if step + 1 == self.max_steps:
+                trainer.repeat_lost(wait=True)
+        self.steps = step + 1
+        if self.steps == self.max_steps:
+            trainer.conclude()
+        output, colors, truth = trainer.seen
+        return StepInfo(output.loss, len(trainer.gaussians), len(truth.samples), colors, truth)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors and numbers for the host's checkpoint, beside its own parameters. A resume is exact on a CPU."""
+        if not self._begun:
+            self._begin()
+        self.trainer.complete()
+        numbers = {"steps": self.steps, "max_steps": self.max_steps, "seed": self.trainer.config.train.seed}
+        return {**numbers, "trainer": self.trainer.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state. `splats` gets the state's values; parameters that are the host's alone must be loaded
+        before.
+
+        Raises:
+            InputError: it is of another training, or not of this form.
+        """
+        present = {"steps": 0, "max_steps": 0, "seed": 0, "trainer": self.trainer.state_dict()}
+        try:
+            require_like(dict(state), present, "state")
+            require(state["max_steps"] == self.max_steps, "state.max_steps", state["max_steps"], f"{self.max_steps}")
+            count = len(state["trainer"]["gaussians"]["means"])
+            for name in [name for name in self.splats if ROLES.get(name, name) not in PARAMETER_NAMES]:
+                rows = len(self.splats[name])
+                require(rows == count, f"rows of splats['{name}']", rows, f"{count} as in the state: load them before")
+            self.trainer.load_state_dict(state["trainer"])
+        except (KeyError, TypeError, IndexError, RuntimeError, ValueError) as error:
+            raise InputError(f"the state does not fit this TurboStep: {error}") from None
+        self.trainer.config.train.seed, self.steps, self._begun = state["seed"], state["steps"], True
+        for name in self.splats:
+            if len(self.splats[name]) != count and name in self.optimizers:
+                self.optimizers[name].state.clear()
+        source = torch.arange(count, device=self.trainer.device)
+        self._follow(RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}))
+
+    def _begin(self) -> None:
+        """Begin with the host's present Gaussians, and a backdrop behind them if one is wanted."""
+        trainer, host = self.trainer, self._checked()
+        kept = BACKDROP_COUNT if trainer.config.train.backdrop else 0
+        backdrop = trainer.gaussians.map(lambda value: value[len(trainer.gaussians) - kept :].clone())
+        backdrop.means += trainer.center
+        pairs = {name: [value, getattr(backdrop, name)] for name, value in host.items()}
+        trainer.begin_with(Gaussians(**{name: torch.cat(pair) for name, pair in pairs.items()}))
+        source = torch.arange(len(trainer.gaussians), device=trainer.device)
+        fresh = source >= len(host)
+        self._follow(RowUpdate(source.masked_fill(fresh, 0), fresh, {}))
+        trainer.initialise_maps()
+        self._begun = True
+
+    def _follow(self, update: RowUpdate) -> None:
+        """Carry a change of rows that the trainer has made over to the host."""
+        now = replace(update, values=dict(self.trainer.gaussians.items()))
+        apply_row_update(now, self.splats, self.optimizers, {}, self.scene)
+
+    def _take_changes(self) -> None:
+        """Take over values of parameters that the host replaced since the last step."""
+        for name, parameter in self.splats.items():
+            ours = dict(self.trainer.gaussians.items()).get(ROLES.get(name, name))
+            if ours is None or parameter.data_ptr() == ours.data_ptr():
+                continue
+            if len(parameter) != len(ours):
+                raise InputError(
+                    f"splats['{name}'] has {len(parameter)} rows, and {len(ours)} after the last step: TurboStep adds "
+                    "and removes Gaussians itself; leave density control out, or begin a new TurboStep"
+                )
+            ours.copy_(parameter.detach().reshape(ours.shape))
+            parameter.data = ours.view(parameter.shape)
+
+    def _checked(self) -> Gaussians:
+        """The host's parameters, of a form that can be trained."""
+        gaussians = host_gaussians(self.splats)
+        for name, parameter in self.splats.items():
+            if parameter.dtype != torch.float32 and ROLES.get(name, name) in PARAMETER_NAMES:
+                raise InputError(f"splats['{name}'] is of {parameter.dtype}: expected torch.float32")
+            if parameter.dim() == 0 or len(parameter) != len(gaussians):
+                raise InputError(
+                    f"splats['{name}'] has shape {tuple(parameter.shape)}: expected {len(gaussians)} rows, one a "
+                    "Gaussian, which can follow them; keep other parameters elsewhere"
+                )
+            if parameter.requires_grad and name not in {*self.optimizers, *ROLES, *PARAMETER_NAMES}:
+                raise InputError(
+                    f"splats['{name}'] is trained by an optimizer of the host: give optimizers, whose rows then follow"
+                )
+        require(gaussians.shN.shape[1] in BANDS, "bands of shN", gaussians.shN.shape[1], f"among {BANDS}")
+        require(len(gaussians) >= 2, "number of Gaussians", len(gaussians), "2 or more")
+        return gaussians
+
+
+class HostTrainer(Trainer):
+    """`Trainer` in a host's world, whose origin may be anywhere: density control and limits see the model with the
+    cameras' centre as origin, where they expect it.
+
+    Attributes:
+        seen: loss, colours and truth of the latest iteration.
+    """
+
+    _world: Gaussians
+
+    def __init__(self, host: TurboStep, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.host, self.center = host, self.views.cameras.centers.mean(dim=0)
+        if self.clearance is not None:
+            self.clearance = replace(self.clearance, centers=self.clearance.centers - self.center)
+
+    def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
+        output = super().supervise(colors, truth, step)
+        self.seen = output, colors, truth
+        return output
+
+    def refine(self, step: Step) -> RowUpdate | None:
+        if not self.density.event_due(step):
+            return super().refine(step)
+        with self._centred():
+            return super().refine(step)
+
+    def follow(self, update: RowUpdate | None) -> None:
+        if update is not None or self.iteration % RESTRAIN_EVERY == 0:
+            with self._centred():
+                super().follow(update)
+
+    def change_rows(self, update: RowUpdate) -> None:
+        if "means" in update.values:
+            update = replace(update, values=update.values | {"means": update.values["means"] + self.center})
+        self.gaussians = self._world
+        super().change_rows(update)
+        self._world = self.gaussians
+        self.host._follow(update)
+        self.gaussians = replace(self._world, means=self._world.means - self.center)
+
+    @contextmanager
+    def _centred(self) -> Iterator[None]:
+        self._world = self.gaussians
+        self.gaussians = replace(self._world, means=self._world.means - self.center)
+        try:
+            yield
+        finally:
+            self.gaussians = self._world
+
+
+class HostRates(LearningRates):
+    """Learning rates, some of which are those of a host's optimizers, by the names of the parameters."""
+
+    host: Mapping[str, torch.optim.Optimizer] = {}
+
+    def at(self, step: Step) -> Any:
+        rates = {name: float(optimizer.param_groups[0]["lr"]) for name, optimizer in self.host.items()}
+        return replace(super().at(step), **rates)
+
+
+def scene_of(images: PosedImages, gaussians: Gaussians, scale: float | None) -> Scene:
+    """A scene of a host's views, in the host's world, with its Gaussians as points and no test views."""
+    points = gaussians.means.cpu()
+    frame = Frame.around(images.cameras.centers.double().numpy(), points.double().numpy())
+    extent = frame.scale if scale is None else float(scale)
+    require(0 < extent < float("inf"), "scene_scale", scale, "above 0 and finite")
+    nothing = replace(images, cameras=images.cameras.select(()), names=(), masks=None)
+    return Scene("host", images, nothing, points, torch.zeros(len(points), 3, dtype=torch.uint8), frame, extent)
+
+
+def _require_options(options: Any) -> None:
+    """Refuse options of a host that would have no effect; what they name is done in the step that this one replaces."""
+    for name, value in WITHOUT_EFFECT.items():
+        if (found := getattr(options, name, value)) != value:
+            raise InputError(f"{name}={found!r} has no effect with TurboStep, whose step is its own: leave it out")
+    strategy = getattr(options, "strategy", None)
+    if isinstance(strategy, DefaultStrategy):
+        strategy.refine_stop_iter = 0
+    elif strategy is not None:
+        name = type(strategy).__name__
+        raise InputError(f"strategy {name} would change the Gaussians beside TurboStep: use DefaultStrategy")
