@@ -3,6 +3,9 @@
     git clone --branch v1.5.3 https://github.com/nerfstudio-project/gsplat .hosts/1.5.3
     python examples/simple_trainer/compare.py --host .hosts/1.5.3 --scenes PATH/fox PATH/caliterra --out dropin
 
+With ``--variants stock step --steps 30000 --marks 7000 --seeds 42 43 44`` it prints how much sooner the whole step
+passes what stock has at 7000 and 30000 steps.
+
 Each run is a process of its own, on a free GPU. ``OUT/dropin.json`` is written anew after each one: every run's marks
 (step, seconds of training alone, PSNR, SSIM, Gaussians), or its error, which stops no other. A run that is there
 already is not done again. For gsplat's own speed, fused-ssim must be installed; a run says what was stood in for.
@@ -59,10 +62,10 @@ class Options:
         scenes: folders with images/ and sparse/0/.
         out: folder of the results.
         variants: some of stock, step, density, errors, lm, sparse, all.
-        steps: of each run.
-        marks: steps after which it is evaluated, beside the last one.
+        steps: of each run; of the whole step at most what it proposes itself.
+        marks: steps after which it is evaluated, beside the last one; the whole step is at each twentieth of its run.
         factor: the photos' own, by which they are smaller: images_4/ at 4.
-        seed: of each run; gsplat's own is 42.
+        seeds: each variant is run with each; gsplat's own is 42.
         limit: seconds that one run may take.
         extra: further arguments of the trainer, in one text.
         python: that of an environment in which gsplat and this package are installed. None: this one, with the host's
@@ -76,7 +79,7 @@ class Options:
     steps: int = 7000
     marks: tuple[int, ...] = (500, 1000, 2000, 3000, 4000, 5000, 6000)
     factor: int = 1
-    seed: int = 42
+    seeds: tuple[int, ...] = (42,)
     limit: float = 600.0
     extra: str = ""
     python: Path | None = None
@@ -103,13 +106,25 @@ def edited_trainer(host: Path, variant: str, folder: Path) -> Path:
     return trainer
 
 
-def train(options: Options, scene: Path, variant: str, gpu: str) -> dict[str, Any]:
+def own_length(scene: Path, most: int) -> int:
+    """The steps that `TurboStep` proposes for the photos of a folder, every eighth of which tests; at most `most`."""
+    from turbogs_plugin.gsplat_bridge import TurboStep
+
+    count = sum(1 for _ in (scene / "images").iterdir())
+    return min(most, TurboStep.proposed_steps(count - -(-count // 8)))
+
+
+def train(options: Options, scene: Path, variant: str, seed: int, gpu: str) -> dict[str, Any]:
     """One run: its record, or its error."""
     batch = SPARSE_VIEWS if sparse_pixels.EDITS in VARIANTS[variant] else 1
-    run = {"scene": scene.name, "variant": variant, "steps": options.steps, "batch": batch, "seed": options.seed}
-    marks = sorted({*options.marks, options.steps})
+    run = {"scene": scene.name, "variant": variant, "steps": options.steps, "batch": batch, "seed": seed}
+    steps, marks = options.steps, options.marks
+    if whole_step.EDITS in VARIANTS[variant]:
+        steps = own_length(scene, options.steps)
+        marks = (*marks, *(steps * part // 20 for part in range(1, 20)))
+    marks = sorted({mark for mark in (*marks, steps) if 0 < mark <= steps})
     paths = [*map(str, options.paths), "" if options.python else os.environ.get("PYTHONPATH", "")]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), "MEASURED_SEED": str(options.seed)}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), "MEASURED_SEED": str(seed)}
     environment |= {"CUDA_VISIBLE_DEVICES": gpu} if gpu else {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -118,8 +133,8 @@ def train(options: Options, scene: Path, variant: str, gpu: str) -> dict[str, An
             command += [edited_trainer(options.host, variant, folder)]
             command += [folder / "record.json", "default", "--disable_viewer", "--disable_video"]
             command += ["--data_dir", scene.resolve(), "--data_factor", options.factor, "--result_dir", folder]
-            command += ["--max_steps", options.steps, "--batch_size", batch, "--save_steps", options.steps]
-            command += ["--eval_steps", *(mark for mark in marks if mark <= options.steps), *options.extra.split()]
+            command += ["--max_steps", steps, "--batch_size", batch, "--save_steps", steps]
+            command += ["--eval_steps", *marks, *options.extra.split()]
             done = subprocess.run(
                 [str(part) for part in command],
                 stdout=subprocess.PIPE,
@@ -153,13 +168,13 @@ def compare(options: Options) -> list[dict[str, Any]]:
     runs = json.loads(file.read_text())["runs"] if file.exists() else []
     runs = [run for run in runs if "error" not in run]
     there = {(run["scene"], run["variant"], run["steps"], run["seed"]) for run in runs}
-    wanted = [(scene, variant) for scene in options.scenes for variant in options.variants]
-    wanted = [(s, v) for s, v in wanted if (s.name, v, options.steps, options.seed) not in there]
+    wanted = [(scene, v, seed) for scene in options.scenes for seed in options.seeds for v in options.variants]
+    wanted = [(scene, v, seed) for scene, v, seed in wanted if (scene.name, v, options.steps, seed) not in there]
     free: SimpleQueue[str] = SimpleQueue()
     for gpu in gpus():
         free.put(gpu)
 
-    def on_a_free_gpu(job: tuple[Path, str]) -> dict[str, Any]:
+    def on_a_free_gpu(job: tuple[Path, str, int]) -> dict[str, Any]:
         gpu = free.get()
         try:
             return train(options, *job, gpu)
@@ -177,6 +192,24 @@ def compare(options: Options) -> list[dict[str, Any]]:
     return runs
 
 
+def sooner(runs: Iterable[dict[str, Any]]) -> list[str]:
+    """How much sooner the whole step passes PSNR and SSIM of each mark of stock, of a scene and a seed."""
+    found = {(run["scene"], run["seed"], run["variant"]): run["marks"] for run in runs if run.get("marks")}
+    lines = []
+    for (scene, seed, variant), marks in sorted(found.items()):
+        for mark in marks if variant == "stock" else ():
+            had = f"{mark['seconds']:.1f} s, {mark['psnr']:.2f} dB, {mark['ssim']:.4f}"
+            ours = found.get((scene, seed, "step"), [])
+            past = [each for each in ours if each["psnr"] >= mark["psnr"] and each["ssim"] >= mark["ssim"]]
+            said = "not passed"
+            if past:
+                first = past[0]
+                said = f"passed after {first['seconds']:.2f} s ({first['psnr']:.2f} dB, {first['ssim']:.4f}): "
+                said += f"{mark['seconds'] / first['seconds']:.1f} times sooner"
+            lines.append(f"{scene} {seed}, stock's {mark['step']} steps ({had}): {said}")
+    return lines
+
+
 def write(file: Path, device: str, runs: Iterable[dict[str, Any]]) -> None:
     record = {"device": device, "date": date.today().isoformat(), "runs": list(runs)}
     file.with_suffix(".part").write_text(json.dumps(record, indent=1) + "\n")
@@ -184,5 +217,6 @@ def write(file: Path, device: str, runs: Iterable[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
-    failed = [run for run in compare(tyro.cli(Options)) if "error" in run]
-    sys.exit(1 if failed else 0)
+    made = compare(tyro.cli(Options))
+    print("\n".join(sooner(made)))
+    sys.exit(1 if any("error" in run for run in made) else 0)
