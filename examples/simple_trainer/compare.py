@@ -194,7 +194,7 @@ def compare(options: Options) -> list[dict[str, Any]]:
 
 def sooner(runs: Iterable[dict[str, Any]]) -> list[str]:
     """How much sooner the whole step passes PSNR and SSIM of each mark of stock, of a scene and a seed."""
-    found = {(run["scene"], run["seed"], run["variant"]): run["marks"] for run in runs if run.get("marks")}
+    found = {(run["scene"], run["seed"], run["variant"]): run["marks"] for run in runs if "marks" in run}
     lines = []
     for (scene, seed, variant), marks in sorted(found.items()):
         for mark in marks if variant == "stock" else ():

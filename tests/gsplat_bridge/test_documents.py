@@ -69,7 +69,8 @@ def test_sampler_and_loss_alone(host, document, language):
     """Sampler and loss work with any model: here a grey image."""
     grey = torch.tensor(0.5, requires_grad=True)
     before = host["maps"].errors.clone()
-    host |= {"view_ids": (0, 1), "step": Step(3, 10, 10), "model": lambda samples: grey.expand(len(samples), 3)}
+    host |= {"view_ids": [0, 1], "model": lambda samples: grey.expand(len(samples), 3)}
+    host |= {"step": Step(3, 10, 10)} if document == DROP_IN else {}
     code = block(document, language, "colors.backward")
     if language == "python":  # leaves the model to the reader
         draw = "samples = sampler.sample(maps, view_ids, rate, step)"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -17,12 +18,13 @@ from turbogs_plugin.scene import Photos, PosedImages
 from turbogs_plugin.types import Cameras
 
 
-def read_items(trainset: Any, name: str, white: float) -> list[dict[str, Any]]:
-    """The items of a data set, by number, read by several threads: "image" [H, W, 3] uint8 and the other entries.
+def read_items(trainset: Any, name: str, white: float, convert: Callable[[Tensor], Tensor]) -> list[dict[str, Any]]:
+    """The items of a data set, by number, read by several threads.
 
     Args:
         trainset: V items with "image" [H, W, 3], 0 .. `white`.
         name: of the data set, for messages.
+        convert: of an image, 0 .. 255, what is kept of it in its item.
 
     Raises:
         InputError: it has no items by number, or cuts random patches (``patch_size``); or an image is no tensor
@@ -48,8 +50,7 @@ def read_items(trainset: Any, name: str, white: float) -> list[dict[str, Any]]:
         low, high = (float(value) for value in image.aminmax())
         if not 0 <= low <= high <= white:
             raise InputError(f"{place}['image'] has values {low:g} .. {high:g}: expected 0 .. {white:g}; see white")
-        scaled = image if image.dtype == torch.uint8 and white == 255 else (image * (255.0 / white)).round()
-        return {**item, "image": scaled.to(torch.uint8), "largest": high}
+        return {**item, "image": convert(image.float() * (255.0 / white)), "largest": high}
 
     # Numbers, not iteration: a data set without __iter__ would be read past its end.
     with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
@@ -61,7 +62,7 @@ def read_items(trainset: Any, name: str, white: float) -> list[dict[str, Any]]:
 
 def posed_images(views: Any, white: float) -> PosedImages:
     """The views of a data set whose items have "image", "K" [3, 3], "camtoworld" [4, 4] and perhaps "mask" [H, W]."""
-    items, cameras = read_items(views, "views", white), []
+    items, cameras = read_items(views, "views", white, lambda image: image.round().to(torch.uint8).cpu()), []
     for number, item in enumerate(items):
         place = f"views[{number}]"
         require_keys(item, ("K", "camtoworld"), place, "expected items as in gsplat's data sets")
@@ -78,7 +79,7 @@ def posed_images(views: Any, white: float) -> PosedImages:
     return PosedImages(
         Cameras(torch.stack([viewmat for viewmat, _ in cameras]).float(), Ks, sizes),
         tuple(map(str, range(len(items)))),
-        Photos(torch.cat([item["image"].reshape(-1, 3).cpu() for item in items]), sizes),
+        Photos(torch.cat([item["image"].reshape(-1, 3) for item in items]), sizes),
         None if masks is None else PixelMasks.from_images(masks),
     )
 

@@ -65,6 +65,5 @@ def maps_of_photos(
     Raises:
         InputError: as `read_items`.
     """
-    items = read_items(trainset, "trainset", white)
-    errors = [item["image"].to(device).float().sum(dim=-1) / 255.0 for item in items]  # [H, W] each
-    return ErrorMaps.from_images(errors, masks_of(items, "trainset"))
+    items = read_items(trainset, "trainset", white, lambda image: image.to(device).sum(dim=-1) / 255.0)
+    return ErrorMaps.from_images([item["image"] for item in items], masks_of(items, "trainset"))
