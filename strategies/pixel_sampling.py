@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -73,7 +72,7 @@ class RandomPixelSampler(PixelSampler):
         Args:
             view_ids: see `view_numbers`.
         """
-        require(0 < rate < math.inf, "rate", rate, "finite and above 0")
+        require(0 < rate <= 1, "rate", rate, "above 0 and at most 1, a share of the pixels")
         require(isinstance(step, Step), "step", step, "a Step, as Step(iteration=0, total=1000, refine_until=500) is")
         return engine_of(maps.errors.device).draw(self.rule, maps, view_numbers(view_ids, maps), rate, step)
 

@@ -165,8 +165,8 @@ def test_errors_of_another_shape_change_nothing(shape):
 
 
 def test_wrong_shape_and_options_are_named():
-    for images in (torch.rand(2, 16, 16, 3), np.zeros((2, 16, 16)), []):
-        with pytest.raises(InputError, match=r"a tensor .H, W. for each view"):
+    for images in (torch.rand(2, 16, 16, 3), np.zeros((2, 16, 16)), [], torch.full((2, 16, 16), torch.nan)):
+        with pytest.raises(InputError, match=r"a finite tensor .H, W. for each view"):
             ErrorMaps.from_images(images)
     with pytest.raises(InputError, match=r"view 1 have shape \(7,\), expected \(200,\)"):
         ErrorMaps(SIZES).initialise(1, torch.zeros(7))

@@ -98,10 +98,10 @@ class ErrorMaps:
             options: further arguments of `ErrorMaps`.
 
         Raises:
-            InputError: there is no image, one is not a tensor [H, W], or a mask has another shape.
+            InputError: there is no image, one is not a finite tensor [H, W], or a mask has another shape.
         """
-        if len(errors) == 0 or any(not isinstance(image, Tensor) or image.dim() != 2 for image in errors):
-            raise InputError("error images: give a tensor [H, W] for each view; torch.from_numpy makes one of an array")
+        if len(errors) == 0 or not all(isinstance(e, Tensor) and e.dim() == 2 and e.isfinite().all() for e in errors):
+            raise InputError("error images: give a finite tensor [H, W] for each view, by torch.from_numpy of an array")
         sizes = np.array([(image.shape[1], image.shape[0]) for image in errors], dtype=np.int64)
         of_pixels = None if masks is None else PixelMasks.from_images(masks)
         maps = cls(sizes, device=errors[0].device, masks=of_pixels, **options)

@@ -1,6 +1,6 @@
 """Sparse pixels in gsplat's trainer: ``python sparse_pixels.py SIMPLE_TRAINER.py``; then train with ``--batch_size 4``.
 
-The trainer's images in tensorboard (``--tb_save_image``) and its depth loss need whole images.
+What needs whole images is refused (a bilateral grid, post-processing, the depth loss); so does ``--tb_save_image``.
 """
 
 from editing import command_line
@@ -16,7 +16,7 @@ EDITS = """
 +        rasterize = sparse_rasterization if "samples" in kwargs else rasterization
 +        render_colors, render_alphas, info = rasterize(
 @@
-+        budget = sparse_budget(len(self.trainset), cfg.batch_size)
++        budget = sparse_budget(len(self.trainset), cfg.batch_size, cfg)
 +        maps = maps_of_photos(self.trainset, device)
 +        sampler = ErrorGuidedPixelSampler()
          # Training loop.

@@ -7,12 +7,12 @@ import pytest
 import torch
 import tyro
 from gsplat import DefaultStrategy, MCMCStrategy
-from helpers.bridge_host import Host, make_splats
+from helpers.bridge_host import Host, arguments, make_splats
 from helpers.optimizers import equal
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.gsplat_bridge import TurboDensityStrategy, apply_row_update
+from turbogs_plugin.gsplat_bridge import TurboDensityStrategy, apply_row_update, sparse_rasterization
 from turbogs_plugin.gsplat_bridge.density_swap import GATES
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 from turbogs_plugin.model.row_order import in_order_of_space
@@ -302,11 +302,77 @@ def test_squares_and_absgrad_must_be_there_or_off():
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("revised_opacity", True), ("pause_refine_after_reset", 5), ("key_for_gradient", "x"), ("top_fraction", 0.0)],
+    [("revised_opacity", True), ("key_for_gradient", "x"), ("top_fraction", 0.0)],
 )
 def test_invalid_fields_are_refused(field, value):
     with pytest.raises(InputError, match=field):
         TurboDensityStrategy(**{field: value})
+
+
+def test_a_pause_after_resets_is_no_matter():
+    with pytest.warns(UserWarning, match="pause_refine_after_reset=5 has no effect"):
+        TurboDensityStrategy(pause_refine_after_reset=5)
+
+
+def test_values_of_the_host_in_the_state_go_from_parent_to_child():
+    host = Host(TurboDensityStrategy(**SOON))
+    host.state |= {"flags": torch.ones(40, dtype=torch.bool), "label": torch.arange(40), "table": torch.ones(3)}
+    start = host.splats["means"].detach().clone()
+    host.train(4)
+    label = host.state["label"]
+    assert host.state["flags"].all() and len(host.state["flags"]) == len(label) > 40 and len(host.state["table"]) == 3
+    assert (host.splats["means"] - start[label]).norm(dim=1).max() < 1.0 and len(label.unique()) > 1
+    for key, ours in (("grad2d", "grad_sums"), ("count", "view_counts")):  # gsplat's names for these sums
+        host.step(4)
+        assert torch.equal(host.state[key], host.state[ours])
+
+
+@pytest.mark.parametrize("tells_errors", [False, True])
+def test_screen_gradients_are_taken_as_the_host_left_them(tells_errors):
+    """A host with a scaled loss divides them by the scale."""
+    sums = []
+    for scale in (1.0, 65536.0):
+        host = Host(TurboDensityStrategy(refine_start_iter=10), tells_errors=tells_errors)
+        backward = torch.Tensor.backward
+
+        def unscaled(loss, scale=scale, host=host, backward=backward):
+            backward(loss * scale)
+            host.info["means2d"].grad /= scale
+            host.info["means2d"].absgrad /= scale
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(torch.Tensor, "backward", unscaled)
+            host.step(0)
+        sums.append((host.state["grad_sums"], host.state["absgrad_sums"], host.state["error_sums"]))
+    for of_one, of_many in zip(*sums, strict=True):
+        torch.testing.assert_close(of_many, of_one)
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_several_renders_a_step(together):
+    """As a list, or by one call after the other: the first one that is due refines."""
+    host = Host(TurboDensityStrategy(**SOON))
+    for step in range(7):
+        infos = []
+        for _ in range(2):
+            colors, _, info = sparse_rasterization(
+                **arguments(host.splats, host.cameras), samples=host.samples, sh_degree=1, absgrad=True
+            )
+            host.strategy.step_pre_backward(host.splats, host.optimizers, host.state, step, info)
+            torch.nn.functional.l1_loss(colors, host.pixels).backward()
+            infos.append(info)
+        for given in [infos] if together else infos:
+            host.strategy.step_post_backward(host.splats, host.optimizers, host.state, step, given)
+        if step == 0:
+            assert float(host.state["view_counts"].max()) == 2 * 3  # renders times cameras
+    assert len(host.splats["means"]) > 40
+
+
+def test_private_operations_of_gsplats_strategy_are_refused_by_name():
+    strategy = TurboDensityStrategy()
+    for operation in (strategy._update_state, strategy._grow_gs, strategy._prune_gs):
+        with pytest.raises(InputError, match="its step_post_backward does all three"):
+            operation({}, {}, {}, 0, packed=False)
 
 
 def test_the_step_where_gsplat_does_not_refine_yet_keeps_the_window():

@@ -11,6 +11,7 @@ from helpers.bridge_host import RATES, SURGERY, Host, make_splats, surgery
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
+from turbogs_plugin.gsplat_bridge.optimizer_swap import MOST_SKIPPED
 from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
@@ -159,9 +160,9 @@ def test_an_iteration_that_a_grad_scaler_skips_in_part_is_skipped_whole(skipped,
 
 @pytest.mark.parametrize("made", [True, False])
 def test_a_member_that_never_has_a_part_is_named(made):
-    """Not made: in the second iteration. Never stepped: once no GradScaler would go on skipping."""
+    """Not made: in the first iteration. Never stepped: once no GradScaler would go on skipping."""
     splats, shared = make_splats(), SharedOptimizer(SparseAdam())
-    names = PARAMETER_NAMES if made else PARAMETER_NAMES[:-1]
+    names = [name for name in PARAMETER_NAMES if made or name != "scales"]
     members = [shared([{"params": splats[name], "lr": 1e-3, "name": name}]) for name in names]
 
     def iteration():
@@ -169,11 +170,42 @@ def test_a_member_that_never_has_a_part_is_named(made):
         for member in members[:5]:
             member.step()
 
-    for _ in range(100 if made else 1):
+    for _ in range(MOST_SKIPPED if made else 0):
         iteration()
-    message = r"of shN was left out, and 100 iterations in a row" if made else "no optimizer of shN: make all six"
+    message = rf"of shN was left out, and {MOST_SKIPPED} iterations were skipped" if made else "no optimizer of scales"
     with pytest.raises(InputError, match=message):
         iteration()
+
+
+def test_gradients_accumulated_in_one_member_are_refused():
+    """Three of four iterations would be lost, though never many in a row."""
+    splats, shared = make_splats(), SharedOptimizer(SparseAdam())
+    members = {name: shared([{"params": splats[name], "name": name}]) for name in PARAMETER_NAMES}
+    with pytest.raises(InputError, match=r"of shN was left out, and 50 iterations were skipped for that, 16 made"):
+        for step in range(100):
+            set_gradients(splats, step)
+            for name, member in members.items():
+                if name != "shN" or step % 4 == 3:
+                    member.step()
+
+
+def test_a_host_without_harmonics_has_five_members():
+    """Colours in the place of band 0 take the steps that band 0 takes."""
+    ends = []
+    for names in ({"sh0": "sh0"}, {"colors": "sh0"}):
+        values = {name: value.detach().clone() for name, value in make_splats().items() if name != "shN"}
+        values |= {new: values.pop(old)[:, 0] for new, old in names.items()}
+        params, shared = (
+            {name: torch.nn.Parameter(value) for name, value in values.items()},
+            SharedOptimizer(SparseAdam()),
+        )
+        members = [shared([{"params": value, "name": name}]) for name, value in params.items()]
+        for value in params.values():
+            value.grad = torch.linspace(-1, 1, value.numel()).reshape(value.shape)
+        for member in members:
+            member.step()
+        ends.append(params[next(iter(names))].detach())
+    assert torch.equal(ends[0], ends[1]) and not torch.equal(ends[0], make_splats()["sh0"][:, 0])
 
 
 def test_closures_that_run_a_backward_each_give_one_update():

@@ -223,7 +223,9 @@ def test_gather_pixels(scene):
 REFUSED = [
     ({"packed": True}, r"packed=True is not supported, only False"),
     ({"render_mode": "D"}, r"render_mode='D' is not supported, only 'RGB', 'ED', 'RGB\+ED'"),
-    ({"pack": False}, r"no option 'pack'"),
+    ({"pack": False}, r"no option 'pack': did you mean 'packed'"),
+    ({"global_z_order": False}, r"global_z_order=False is not supported, only True"),
+    ({"tile_size": 8}, r"tile_size=8 is not supported, only 16"),
     ({"scales": torch.ones(3, 3)}, r"scales has shape \(3, 3\): expected \[40, 3\]"),
     ({"colors": torch.ones(40, 3, 3)}, r"sh_degree 1 needs 4 bands: colors have 3"),
     ({"sh_degree": 0.5}, r"sh_degree is 0.5: expected a whole number"),
@@ -242,6 +244,14 @@ def test_what_does_not_fit_is_refused_by_name(scene, changed, message):
     splats, cameras, samples = scene
     with pytest.raises(InputError, match=message):
         sparse_rasterization(**{**arguments(splats, cameras), "samples": samples, "sh_degree": 1, **changed})
+
+
+def test_what_gsplat_and_its_main_branch_do_by_default_is_taken(scene):
+    splats, cameras, samples = scene
+    asked = {"tile_size": None, "channel_chunk": 32, "global_z_order": True, "return_normals": False, "rays": None}
+    asked |= {"extra_signals": None, "renderer_config": None, "ut_params": None, "radius_clip": 0}
+    given = {**arguments(splats, cameras), "samples": samples, "sh_degree": 1}
+    assert torch.equal(sparse_rasterization(**given, **asked)[0], sparse_rasterization(**given)[0])
 
 
 @pytest.mark.parametrize("name", ["viewmats", "Ks"])
@@ -265,6 +275,7 @@ def test_what_does_not_fit_the_samples_is_refused_by_name(scene):
         "samples is a NoneType: expected the PixelSamples": (loss, colors, colors, None),
         rf"targets is torch.uint8 .*: expected floating point \({count}, 3\)": (loss, colors, colors.byte(), samples),
         r"loss is the class CharbonnierLoss: expected an instance": (CharbonnierLoss, colors, colors, samples),
+        r"loss takes no \(colors, targets, samples\)": (torch.nn.L1Loss(), colors, colors, samples),
         r"maps and step are ErrorMaps and NoneType: .* both or neither": (loss, colors, colors, samples, maps),
         r"maps are on meta: expected cpu": (loss, colors, colors, samples, ErrorMaps(cameras.sizes, "meta"), now),
     }

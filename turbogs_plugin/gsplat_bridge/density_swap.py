@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -10,18 +12,18 @@ from gsplat.strategy import DefaultStrategy
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError, require
-from turbogs_plugin.gsplat_bridge.gaussian_errors import WITHOUT_GRADIENT, iteration_stats
+from turbogs_plugin.gsplat_bridge.gaussian_errors import WITHOUT_GRADIENT, iteration_stats, rows_of
 from turbogs_plugin.gsplat_bridge.host import (
     GEOMETRY,
     GROUND_TRUTH,
     PREDICTION,
-    ROLES,
     STATISTICS,
     Optimizers,
     Parameters,
     host_gaussians,
     require_keys,
     require_one_process,
+    role_of,
 )
 from turbogs_plugin.gsplat_bridge.optimizer_swap import COUNT, MemberOptimizer
 from turbogs_plugin.model.row_order import in_order_of_space
@@ -53,6 +55,10 @@ TUNED_DENSITY = ErrorDrivenDensity(**TUNED["density"] | GATES)
 _STATS = tuple(field.name for field in fields(GaussianStats))
 _DRIVEN_BY = "driven_by"
 _STATE_KEYS = ("scene_scale", _DRIVEN_BY, *_STATS)
+_AS_GSPLAT = {"grad2d": "grad_sums", "count": "view_counts"}
+"""Keys that gsplat's state has for the same sums."""
+_SUMS = {*_STATS, *_AS_GSPLAT}
+_REFINED = "refined"
 
 _ANNOUNCEMENTS = {
     "error": f"error-driven, by info['{PREDICTION}'] and info['{GROUND_TRUTH}']",
@@ -110,14 +116,24 @@ class TurboDensityStrategy(DefaultStrategy):
     def __post_init__(self) -> None:
         require(not self.revised_opacity, "revised_opacity", self.revised_opacity, "False: splits copy the opacity")
         pause, key = self.pause_refine_after_reset, self.key_for_gradient
-        require(pause == 0, "pause_refine_after_reset", pause, "0: opacities are never reset")
+        if pause:
+            warnings.warn(f"pause_refine_after_reset={pause} has no effect: opacities are never reset", stacklevel=3)
         require(key == "means2d", "key_for_gradient", key, "'means2d': error sums are of 3D Gaussians")
         self._controller(0)  # checks the rest
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """The running state, to be passed to both hooks: `GaussianStats`' tensors by name, once the first step made
         them, so that gsplat's own operations carry them along."""
-        return {"scene_scale": scene_scale, _DRIVEN_BY: None, **dict.fromkeys(_STATS)}
+        return {"scene_scale": scene_scale, _DRIVEN_BY: None, **dict.fromkeys((_REFINED, *_STATS, *_AS_GSPLAT))}
+
+    def _grow_gs(self, *arguments: Any, **options: Any) -> Any:
+        """Private operations of `DefaultStrategy` that some hosts call: refused by name."""
+        raise InputError(
+            "TurboDensityStrategy has no _update_state, _grow_gs and _prune_gs: its step_post_backward does all three; "
+            "call that, or keep gsplat's DefaultStrategy"
+        )
+
+    _prune_gs = _update_state = _grow_gs
 
     def step_pre_backward(
         self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any]
@@ -139,7 +155,7 @@ class TurboDensityStrategy(DefaultStrategy):
         optimizers: Optimizers,
         state: dict[str, Any],
         step: int,
-        info: dict[str, Any],
+        info: dict[str, Any] | Sequence[dict[str, Any]],
         packed: bool = False,
         scene: Any = None,
         **host_options: Any,
@@ -147,6 +163,8 @@ class TurboDensityStrategy(DefaultStrategy):
         """To be called after the optimizers' steps. Changes `params`, `optimizers` and `state` in place.
 
         Args:
+            info: of the step's render; where it has several, of all of them. A host may also call this for one after
+                the other: then the first call refines, and what follows within that step no longer counts.
             packed, host_options: what hosts hand to their own strategies; not used. `info` says itself whether it is
                 packed.
             scene: of gsplat from 1.6 on, a container with more arrays over Gaussians, whose rows follow.
@@ -160,7 +178,13 @@ class TurboDensityStrategy(DefaultStrategy):
         if step - self.refine_stop_iter + 1 > (0 if self.final_keep == 1 else FINAL_PRUNINGS * self.final_every):
             return
         gaussians = host_gaussians(params, GEOMETRY)
-        window = self._accumulate(state, info, len(gaussians))
+        infos = [info] if isinstance(info, dict) else info
+        if state is not None and state.get(_REFINED) == step:
+            infos = [each for each in infos if rows_of(each) in (None, len(gaussians))]
+        for each in infos:
+            window = self._accumulate(state, each, len(gaussians))
+        if not infos:
+            return
         if not self._due(step):
             return
         controller = self._controller(step)
@@ -173,6 +197,7 @@ class TurboDensityStrategy(DefaultStrategy):
         window.zero_()
         if update is None:
             return
+        state[_REFINED] = step
         apply_row_update(in_order_of_space(update, gaussians, now), params, optimizers, state, scene)
         if self.verbose:
             print(
@@ -218,6 +243,7 @@ class TurboDensityStrategy(DefaultStrategy):
                 )
         window = GaussianStats(**{name: state[name] for name in _STATS})
         add_stats(window, stats)
+        state.update({key: state[name] for key, name in _AS_GSPLAT.items()})
         return window
 
     def _due(self, step: int) -> bool:
@@ -265,7 +291,7 @@ def apply_row_update(
     """
     count = len(params["means"])
     for name, parameter in [*params.items()]:
-        role = ROLES.get(name, name)
+        role = role_of(name, params)
         if role in update.values:
             value = update.values[role].reshape(-1, *parameter.shape[1:])  # a host's own layout
         else:
@@ -275,16 +301,16 @@ def apply_row_update(
         if name in optimizers:
             optimizer = optimizers[name]
             rows = optimizer.state.pop(parameter, {})
-            for key in rows.keys() - {COUNT}:
+            for key in [key for key, kept in rows.items() if key != COUNT and kept.dim() and len(kept) == count]:
                 rows[key] = update.apply_state(rows[key])
                 if role in update.reset:
                     rows[key].zero_()
             optimizer.state[replaced] = rows
             for group in optimizer.param_groups:
                 group["params"] = [replaced]
-    for key, value in state.items():
-        if isinstance(value, Tensor):
-            state[key] = update.apply_state(value)
+    for key, value in state.items():  # as by gsplat's operations, a host's own values go from parent to child
+        if isinstance(value, Tensor) and value.dim() > 0 and len(value) == count:
+            state[key] = update.apply_state(value) if key in _SUMS else value[update.source]
     if scene is not None:  # any choice of rows is a copy of them behind the old ones, which then go
         scene.on_duplicate(update.source)
         scene.on_remove(torch.arange(count + len(update.source), device=update.source.device) < count)

@@ -13,6 +13,7 @@ Three sources, best first:
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -50,7 +51,8 @@ def residuals(info: dict[str, Any]) -> Tensor | None:
             f"info['{PREDICTION}'] has shape {tuple(prediction.shape)}, info['{GROUND_TRUTH}'] {tuple(truth.shape)}: "
             "expected both [C, H, W, 3], or both [P, 3] with sparse pixels"
         )
-    return (prediction - truth).abs().sum(dim=-1)
+    errors = (prediction - truth).abs().sum(dim=-1)
+    return errors[None] if errors.dim() == 2 else errors  # of one image [H, W, 3]
 
 
 def iteration_stats(info: dict[str, Any], count: int) -> tuple[GaussianStats, bool]:
@@ -67,10 +69,9 @@ def iteration_stats(info: dict[str, Any], count: int) -> tuple[GaussianStats, bo
         InputError: `info` lacks a key or a gradient, or is of another number of Gaussians.
     """
     require_keys(info, ("means2d",), "info", "pass what the rasterization returned")
-    if info.get(STATISTICS) is not None:
-        _require_count(len(info[STATISTICS].view_counts), count)
-        return info[STATISTICS], True
     stats = screen_statistics(info, count)
+    if info.get(STATISTICS) is not None:  # with the screen gradients as the host left them: unscaled, say
+        return replace(info[STATISTICS], grad_sums=stats.grad_sums, absgrad_sums=stats.absgrad_sums), True
     sums = _error_sums(info, count)
     if sums is None:
         return stats, False
@@ -111,6 +112,11 @@ def _error_sums(info: dict[str, Any], count: int) -> Tensor | None:
     else:
         info[ERROR_SUMS] = sums.new_zeros(count, 2).index_add(0, ids.long(), sums)
     return info[ERROR_SUMS]
+
+
+def rows_of(info: dict[str, Any]) -> int | None:
+    """The number of Gaussians that `info` is of; None where it is packed."""
+    return None if info.get("gaussian_ids") is not None else info["means2d"].shape[-2]
 
 
 def _require_count(found: int, count: int) -> None:

@@ -35,10 +35,30 @@ LAYOUTS: dict[str, list[tuple[str | int, ...]]] = {
 """Shapes of each parameter, N Gaussians with B harmonics above band 0: gsplat's, then nerfstudio's splatfacto's, which
 is taken too."""
 
-ROLES = {"features_dc": "sh0", "features_rest": "shN"}
-"""Names that splatfacto has for gsplat's."""
+ROLES = {"features_dc": "sh0", "features_rest": "shN", "colors": "sh0"}
+"""Names that hosts have for gsplat's: splatfacto's, and colours where there are no harmonics."""
 
 GEOMETRY = ("means", "quats", "scales", "opacities")
+
+
+IN_IMAGES: dict[str, Any] = {
+    **dict.fromkeys(("use_bilateral_grid", "use_fused_bilagrid", "depth_loss", "with_ut"), False),
+    "post_processing": None,
+    "camera_model": "pinhole",
+}
+"""Options of gsplat's trainer that need whole images or its own rasterizer, and the value that asks for nothing."""
+
+
+def require_options(options: Any, nothing: Mapping[str, Any], swap: str) -> None:
+    """Raise `InputError` where the options of a host ask for something that has no effect with a swap.
+
+    Args:
+        options: with attributes, as gsplat's `Config`; None: there are none.
+        nothing: name of an option -> the value that asks for nothing.
+    """
+    for name, value in nothing.items():
+        if (found := getattr(options, name, value)) != value:
+            raise InputError(f"{name}={found!r} does not work with {swap}: leave it out")
 
 
 def require_one_process(swap: str) -> None:
@@ -64,6 +84,12 @@ def require_keys(mapping: Mapping[str, Any] | Parameters | None, keys: Iterable[
         raise InputError(f"{what} has no {', '.join(repr(key) for key in missing)}: {remedy}")
 
 
+def role_of(name: str, params: Mapping[str, Any] | Parameters) -> str:
+    """gsplat's name for a parameter of a host: by `ROLES`, where no other parameter has that name."""
+    role = ROLES.get(name, name)
+    return name if role in params else role
+
+
 def host_gaussians(params: Mapping[str, Tensor] | Parameters, names: Iterable[str] = PARAMETER_NAMES) -> Gaussians:
     """A host's parameters as `Gaussians`. The tensors share memory with the parameters and have no gradient.
 
@@ -76,7 +102,7 @@ def host_gaussians(params: Mapping[str, Tensor] | Parameters, names: Iterable[st
         InputError: a parameter is missing, or has another shape than in gsplat's layout (opacities [N, 1] and sh0
             [N, 3] are taken, too), or another number of rows.
     """
-    params = {ROLES.get(name, name): value for name, value in params.items()}
+    params = {role_of(name, params): value for name, value in params.items()}
     require_keys(params, names, "params", f"expected {', '.join(names)}")
     count = params["means"].shape[0]
     for name in [name for name in PARAMETER_NAMES if name in params]:

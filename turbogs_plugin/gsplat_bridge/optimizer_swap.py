@@ -24,7 +24,7 @@ from torch import Tensor
 from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
-from turbogs_plugin.gsplat_bridge.host import host_gaussians, require_one_process
+from turbogs_plugin.gsplat_bridge.host import GEOMETRY, ROLES, host_gaussians, require_one_process
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, Step
@@ -35,8 +35,12 @@ operations take every other value for one with rows."""
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
-MOST_SKIPPED = 100
-"""Iterations in a row that may be skipped. A `GradScaler` halves its scale at each, so it needs a few dozen at most."""
+MOST_SKIPPED = 50
+"""Iterations that may be skipped where fewer are made. A `GradScaler` halves its scale at each, so it needs a few dozen
+at most."""
+
+NEEDED = (*GEOMETRY, "sh0")
+"""Parameters without whose optimizer there is no update: a host may have no harmonics."""
 
 
 class SharedOptimizer:
@@ -64,10 +68,11 @@ class SharedOptimizer:
         self.members: dict[str, MemberOptimizer] = {}
         self.skipped: Tensor | None = None
         self._gradients: dict[str, Tensor | None] = {}
-        self._info: dict[str, Any] | None = None
+        self._infos: list[dict[str, Any]] = []  # shown since the first gradient of this round
+        self._shown: list[dict[str, Any]] = []  # shown before it
         self._told = False
         self._told_skipped = False
-        self._skipped_in_a_row = 0
+        self._made = self._dropped = 0
 
     def __call__(
         self,
@@ -94,9 +99,11 @@ class SharedOptimizer:
         return member
 
     def observe(self, info: dict[str, Any]) -> None:
-        """Show this iteration's `info`, before or after backward. From "prediction" and "ground_truth" in it follow the
-        Gaussians' shares of the loss, which the damped system needs; without them the step is Adam's."""
-        self._info = info
+        """Show this iteration's `info`, before or after backward; of several renders, one after the other. From
+        "prediction" and "ground_truth" in it follow the Gaussians' shares of the loss, which the damped system needs;
+        without them the step is Adam's."""
+        if all(info is not other for other in self._infos):
+            self._infos.append(info)
 
     def hand_over(self, name: str, gradient: Tensor | None) -> None:
         """Take a member's gradient; the last one to come carries out the update of all parameters.
@@ -109,8 +116,10 @@ class SharedOptimizer:
                 f"the optimizer of '{name}' was stepped twice: expected, as one update is shared by all, "
                 f"a step of {', '.join(self._waiting())} in between"
             )
+        if not self._gradients:
+            self._shown, self._infos = self._infos, []
         self._gradients[name] = gradient
-        if len(self._gradients) == len(PARAMETER_NAMES):
+        if len(self._gradients) == len(self.members):
             self._update()
 
     def drop_stale(self) -> None:
@@ -120,50 +129,51 @@ class SharedOptimizer:
         parameters, so no update mixes two iterations. The first such iteration is printed.
 
         Raises:
-            InputError: a member that was left out was never made, or `MOST_SKIPPED` iterations in a row lacked one.
+            InputError: `MOST_SKIPPED` iterations, and more than were made, lacked a member.
         """
         if all(self.members[name].parameter.grad is None for name in self._gradients):
             return  # no backward ran since they were handed over
         waiting = self._waiting()
-        never_made = [name for name in waiting if name not in self.members]
-        if never_made:
-            raise InputError(
-                f"there is no optimizer of {', '.join(never_made)}: make all six, as one update is shared by all"
-            )
         self._gradients = {}
-        self._skipped_in_a_row += 1
-        if self._skipped_in_a_row == MOST_SKIPPED:
+        self._dropped += 1
+        if self._dropped >= max(MOST_SKIPPED, self._made):
             raise InputError(
-                f"the optimizer of {', '.join(waiting)} was left out, and {MOST_SKIPPED} iterations in a row were "
-                "skipped for that: step all six in each iteration, also without a gradient; where a GradScaler leaves "
-                "one out, see why its gradient is never finite"
+                f"the optimizer of {', '.join(waiting)} was left out, and {self._dropped} iterations were skipped for "
+                f"that, {self._made} made: step all in each iteration, with no gradient accumulated in one of them; "
+                "where a GradScaler leaves one out, see why its gradient is never finite"
             )
         if not self._told_skipped:
             print(
                 f"SharedOptimizer: an iteration was skipped, as in it the optimizer of {', '.join(waiting)} was not "
-                "stepped. A GradScaler does that after an inf; else step all six in each iteration."
+                "stepped. A GradScaler does that after an inf; else step all in each iteration."
             )
         self._told_skipped = True
 
     def _waiting(self) -> list[str]:
         """The parameters whose gradient this round lacks."""
-        return [name for name in PARAMETER_NAMES if name not in self._gradients]
+        return [name for name in PARAMETER_NAMES if name in self.members and name not in self._gradients]
 
     def _update(self) -> None:
         require_one_process("SharedOptimizer")
-        members, gradients, info = self.members, self._gradients, self._info
-        self._gradients, self._info, self._skipped_in_a_row = {}, None, 0
+        members, gradients = self.members, self._gradients
+        missing = [name for name in NEEDED if name not in members]
+        if missing:
+            raise InputError(
+                f"there is no optimizer of {', '.join(missing)}: make one of each parameter, as one update is shared"
+            )
+        self._gradients = {}
+        self._made += 1
         if all(gradient is None for gradient in gradients.values()):
             return
-        gaussians = host_gaussians({name: members[name].parameter for name in PARAMETER_NAMES})
+        gaussians = host_gaussians({name: member.parameter for name, member in members.items()}, members)
         given: dict[str, Tensor] = {}
         for name, value in gaussians.items():
-            gradient = gradients[name]
+            gradient = gradients.get(name)
             given[name] = torch.zeros_like(value) if gradient is None else gradient.reshape(value.shape)
         self._take_options()
         moments = self._pack(gaussians)
         self.optimizer.moments = moments
-        self.optimizer.step(gaussians, _one_row(given, self._shares(gaussians, info)), Step(0, 1, 1))
+        self.optimizer.step(gaussians, _one_row(given, self._shares(gaussians)), Step(0, 1, 1))
         for place, moment in self._moments(moments):
             moment.copy_(place.reshape(moment.shape))
         members["means"].checked_state()[COUNT] += 1
@@ -205,10 +215,11 @@ class SharedOptimizer:
             state = member.checked_state()
             yield from ((packed.part(moment, name), state[moment]) for moment in MOMENTS)
 
-    def _shares(self, gaussians: Gaussians, info: dict[str, Any] | None) -> Tensor:
-        """[1, N] the Gaussians' share of the loss, zero where nothing is known of it."""
-        shares = None if info is None else loss_shares(info, len(gaussians))
-        if shares is None:
+    def _shares(self, gaussians: Gaussians) -> Tensor:
+        """[1, N] the Gaussians' share of the loss, a mean over the renders; zero where nothing is known of it."""
+        known = [loss_shares(info, len(gaussians)) for info in self._shown]
+        shares = [value for value in known if value is not None]
+        if not shares:
             if not self._told and self.optimizer.lm is not None:
                 print(
                     f"{type(self.optimizer).__name__}: the Gaussians' shares of the loss are not known, so steps are "
@@ -217,7 +228,7 @@ class SharedOptimizer:
                 )
             self._told = True
             return gaussians.means.new_zeros(1, len(gaussians))
-        return shares.to(gaussians.means.dtype)[None]
+        return torch.stack(shares).mean(dim=0, keepdim=True).to(gaussians.means.dtype)
 
 
 class MemberOptimizer(torch.optim.Optimizer):
@@ -225,15 +236,17 @@ class MemberOptimizer(torch.optim.Optimizer):
 
     def __init__(self, shared: SharedOptimizer, groups: list[Any], defaults: dict[str, Any]) -> None:
         names = [group.get("name") if isinstance(group, dict) else None for group in groups]
-        if len(names) != 1 or names[0] not in PARAMETER_NAMES:
+        roles = [ROLES.get(str(name), name) for name in names]
+        if len(roles) != 1 or roles[0] not in PARAMETER_NAMES:
             raise InputError(
                 f"a member of a shared update takes one group with a 'name' among {', '.join(PARAMETER_NAMES)}, got "
-                f"groups named {names}; give other parameters an optimizer of their own"
+                f"groups named {names}: write [{{'params': p, 'name': 'means'}}] in the place of [p]; parameters of "
+                "other names keep an optimizer of their own"
             )
         super().__init__(groups, defaults)
         require(len(self.param_groups[0]["params"]) == 1, "params", self.param_groups[0]["params"], "one tensor")
         self.shared = shared
-        self.name: str = groups[0]["name"]
+        self.name: str = roles[0]
 
     def __getstate__(self) -> dict[str, Any]:
         """State for copies and pickles, with the part that torch's lacks. Members are copied together, as each

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import weakref
 from collections.abc import Callable
 from numbers import Integral
@@ -17,7 +18,7 @@ from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.errors import InputError, nearest
 from turbogs_plugin.gsplat_bridge.autograd import DifferentiableRender, rasterize_differentiable
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
 from turbogs_plugin.gsplat_bridge.host import (
@@ -39,11 +40,12 @@ ONE_RADIUS = Version(gsplat.__version__) < Version("1.5")
 RENDER_MODES = ("RGB", "ED", "RGB+ED")
 """Render modes of gsplat that are supported here: colours, expected depth, or both."""
 
-_ONLY = {"radius_clip": 0.0, "tile_size": TILE_SIZE, "rasterize_mode": "classic", "camera_model": "pinhole"}
-_ONLY |= dict.fromkeys(("packed", "sparse_grad", "distributed", "segmented", "with_ut", "with_eval3d"), False)
-_ONLY |= dict.fromkeys(("covars", "ftheta_coeffs", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs"))
-_ONLY |= {"viewmats_rs": None}
-"""Options of gsplat's `rasterization` that hosts pass, and the one value of each that there is here."""
+_MAIN = "rays lidar_coeffs external_distortion_coeffs ut_params extra_signals extra_signals_sh_degree renderer_config"
+_ONLY: dict[str, Any] = {"return_normals": False, "global_z_order": True, **dict.fromkeys(_MAIN.split(" "))}
+_ONLY |= {name: option.default for name, option in inspect.signature(gsplat.rasterization).parameters.items()}
+_ONLY |= {"packed": False, "tile_size": TILE_SIZE}
+"""Options of gsplat's `rasterization`, its main branch's first, and the one value that each has here: but for
+`packed`, gsplat's default. None asks for nothing, too."""
 
 
 def sparse_rasterization(
@@ -156,7 +158,10 @@ def gather_pixels(images: Tensor, samples: PixelSamples) -> Tensor:
         raise InputError(f"images is a {type(images).__name__}: expected a tensor [C, H, W, D]")
     expected = [(int(height), int(width)) for width, height in samples.sizes]
     if images.dim() != 4 or [tuple(images.shape[1:3])] * len(images) != expected:
-        raise InputError(f"images have shape {tuple(images.shape)}: expected [C, H, W, D] with H, W = {expected}")
+        raise InputError(
+            f"images have shape {tuple(images.shape)}: expected [C, H, W, D] with H, W = {expected}, the images of the "
+            "samples' views alone: images[view_ids] of those of all views"
+        )
     flat = images.flatten(0, 2)  # [C * H * W, D]
     pixels = samples.view_of_slot() * (images.shape[1] * images.shape[2]) + samples.pixel_ids.long().clamp(min=0)
     return flat[pixels] * samples.filled[:, None]
@@ -223,7 +228,10 @@ def _call(loss: Any, colors: Tensor, targets: Tensor, samples: PixelSamples) -> 
     Raises:
         InputError: `loss` is a class, or gives anything but a `LossOutput`.
     """
-    output = None if isinstance(loss, type) else loss(colors, targets, samples)
+    try:
+        output = None if isinstance(loss, type) else loss(colors, targets, samples)
+    except TypeError as error:  # a loss of whole images takes two
+        raise InputError(f"loss takes no (colors, targets, samples), as CharbonnierNccLoss() does: {error}") from error
     if not isinstance(output, LossOutput):
         found = f"the class {loss.__name__}" if isinstance(loss, type) else f"a {type(loss).__name__}"
         raise InputError(
@@ -298,8 +306,8 @@ def _check_samples(samples: Any) -> None:
 def _check_options(options: dict[str, Any]) -> None:
     for name, value in options.items():
         if name not in _ONLY:
-            raise InputError(f"sparse_rasterization has no option '{name}'; of gsplat's it takes {', '.join(_ONLY)}")
-        if isinstance(value, Tensor) or value != _ONLY[name]:
+            raise InputError(f"sparse_rasterization has no option '{name}': {nearest(name, _ONLY)}")
+        if value is not None and (isinstance(value, Tensor) or value != _ONLY[name]):
             found = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)
             raise InputError(f"sparse_rasterization: {name}={found} is not supported, only {_ONLY[name]!r}")
 

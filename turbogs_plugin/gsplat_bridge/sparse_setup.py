@@ -11,6 +11,7 @@ import torch
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import require
 from turbogs_plugin.gsplat_bridge.density_swap import TUNED
+from turbogs_plugin.gsplat_bridge.host import IN_IMAGES, require_options
 from turbogs_plugin.gsplat_bridge.host_views import masks_of, read_items
 from turbogs_plugin.strategies.schedule import SinusoidalSchedule
 from turbogs_plugin.types import SamplingBudget
@@ -23,7 +24,7 @@ DEFAULT_VIEWS = 4
 pixels alone is less than stock sees."""
 
 
-def sparse_budget(num_views: int, batch_size: int | None = None) -> SamplingBudget:
+def sparse_budget(num_views: int, batch_size: int | None = None, options: Any = None) -> SamplingBudget:
     """Views and rate of every step of a gsplat trainer with sparse pixels; prints in one line what it chose.
 
     The rule: a step sees as many pixels as one whole image has, which is what a stock trainer sees at batch 1, spread
@@ -36,9 +37,12 @@ def sparse_budget(num_views: int, batch_size: int | None = None) -> SamplingBudg
         batch_size: K, where the trainer has settled it; None takes `DEFAULT_VIEWS`, or V if that is less. Give the
             data loader `views` of the result.
 
+        options: of the trainer, as gsplat's `Config`: those that need whole images are refused.
+
     Raises:
-        InputError: a number below 1, or a batch of more views than there are.
+        InputError: a number below 1, a batch of more views than there are, or such an option.
     """
+    require_options(options, IN_IMAGES, "sparse pixels, which are no images")
     whole = "a whole number, 1 or more"
     require(isinstance(num_views, Integral) and num_views >= 1, "num_views", num_views, whole)
     if batch_size is not None:

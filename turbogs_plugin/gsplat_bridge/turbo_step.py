@@ -17,12 +17,14 @@ from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.density_swap import apply_row_update
 from turbogs_plugin.gsplat_bridge.host import (
-    ROLES,
+    IN_IMAGES,
     Optimizers,
     Parameters,
     host_gaussians,
     require_keys,
     require_one_process,
+    require_options,
+    role_of,
 )
 from turbogs_plugin.gsplat_bridge.host_views import posed_images
 from turbogs_plugin.model.gsplat_file import BANDS
@@ -37,15 +39,8 @@ from turbogs_plugin.train.checkpoint import require_like
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, LossOutput, RowUpdate, Step
 
-_SWITCHES = (
-    "app_opt pose_opt pose_noise depth_loss use_bilateral_grid use_fused_bilagrid with_ut with_eval3d antialiased"
-)
-_SWITCHES += " antialiased random_bkgd sparse_grad visible_adam opacity_reg scale_reg"
-WITHOUT_EFFECT: dict[str, Any] = dict.fromkeys(_SWITCHES.split(), 0) | {
-    "post_processing": None,
-    "camera_model": "pinhole",
-    "batch_size": 1,
-}
+_STEP = "app_opt pose_opt pose_noise with_eval3d antialiased random_bkgd sparse_grad visible_adam opacity_reg scale_reg"
+WITHOUT_EFFECT: dict[str, Any] = {**IN_IMAGES, **dict.fromkeys(_STEP.split(" "), False), "batch_size": 1}
 """Options of gsplat's trainer that change its own step alone, and the value that asks for nothing."""
 
 
@@ -123,7 +118,8 @@ class TurboStep:
         overrides: Sequence[str] = (),
     ) -> None:
         require_one_process("TurboStep")
-        _require_options(options)
+        require_options(options, WITHOUT_EFFECT, "TurboStep, whose step is its own")
+        _lay_to_rest(getattr(options, "strategy", None))
         self.splats, self.optimizers, self.scene = splats, {} if optimizers is None else optimizers, scene
         gaussians = self._checked()
         device, degree = gaussians.device, gaussians.sh_degree
@@ -144,7 +140,7 @@ class TurboStep:
                     f"optimizer.type '{settings.optimizer['type']}' has no learning rates: leave out rates"
                 )
             own_rates = self.trainer.optimizer.learning_rates = HostRates(**vars(self.trainer.optimizer.learning_rates))
-            own_rates.host = {ROLES.get(name, name): self.optimizers[name] for name in rates}
+            own_rates.host = {role_of(name, self.splats): self.optimizers[name] for name in rates}
         self.steps, self.max_steps, self._begun = 0, self.trainer.iterations, False
 
     @staticmethod
@@ -197,7 +193,7 @@ class TurboStep:
             require_like(dict(state), present, "state")
             require(state["max_steps"] == self.max_steps, "state.max_steps", state["max_steps"], f"{self.max_steps}")
             count = len(state["trainer"]["gaussians"]["means"])
-            for name in [name for name in self.splats if ROLES.get(name, name) not in PARAMETER_NAMES]:
+            for name in [name for name in self.splats if role_of(name, self.splats) not in PARAMETER_NAMES]:
                 rows = len(self.splats[name])
                 require(rows == count, f"rows of splats['{name}']", rows, f"{count} as in the state: load them before")
             self.trainer.load_state_dict(state["trainer"])
@@ -232,7 +228,7 @@ class TurboStep:
     def _take_changes(self) -> None:
         """Take over values of parameters that the host replaced since the last step."""
         for name, parameter in self.splats.items():
-            ours = dict(self.trainer.gaussians.items()).get(ROLES.get(name, name))
+            ours = dict(self.trainer.gaussians.items()).get(role_of(name, self.splats))
             if ours is None or parameter.data_ptr() == ours.data_ptr():
                 continue
             if len(parameter) != len(ours):
@@ -247,14 +243,14 @@ class TurboStep:
         """The host's parameters, of a form that can be trained."""
         gaussians = host_gaussians(self.splats)
         for name, parameter in self.splats.items():
-            if parameter.dtype != torch.float32 and ROLES.get(name, name) in PARAMETER_NAMES:
+            if parameter.dtype != torch.float32 and role_of(name, self.splats) in PARAMETER_NAMES:
                 raise InputError(f"splats['{name}'] is of {parameter.dtype}: expected torch.float32")
             if parameter.dim() == 0 or len(parameter) != len(gaussians):
                 raise InputError(
                     f"splats['{name}'] has shape {tuple(parameter.shape)}: expected {len(gaussians)} rows, one a "
                     "Gaussian, which can follow them; keep other parameters elsewhere"
                 )
-            if parameter.requires_grad and name not in {*self.optimizers, *ROLES, *PARAMETER_NAMES}:
+            if parameter.requires_grad and role_of(name, self.splats) not in {*self.optimizers, *PARAMETER_NAMES}:
                 raise InputError(
                     f"splats['{name}'] is trained by an optimizer of the host: give optimizers, whose rows then follow"
                 )
@@ -334,12 +330,8 @@ def scene_of(images: PosedImages, gaussians: Gaussians, scale: float | None) -> 
     return Scene("host", images, nothing, points, torch.zeros(len(points), 3, dtype=torch.uint8), frame, extent)
 
 
-def _require_options(options: Any) -> None:
-    """Refuse options of a host that would have no effect; what they name is done in the step that this one replaces."""
-    for name, value in WITHOUT_EFFECT.items():
-        if (found := getattr(options, name, value)) != value:
-            raise InputError(f"{name}={found!r} has no effect with TurboStep, whose step is its own: leave it out")
-    strategy = getattr(options, "strategy", None)
+def _lay_to_rest(strategy: Any) -> None:
+    """Have a host's strategy change nothing. Raises `InputError` for one that would go on."""
     if isinstance(strategy, DefaultStrategy):
         strategy.refine_stop_iter = 0
     elif strategy is not None:
