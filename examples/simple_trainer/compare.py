@@ -62,7 +62,7 @@ class Options:
         scenes: folders with images/ and sparse/0/.
         out: folder of the results.
         variants: some of stock, step, density, errors, lm, sparse, all.
-        steps: of each run; of the whole step at most what it proposes itself.
+        steps: of each run; the whole step has `own_steps`, or at most what it proposes itself.
         marks: steps after which it is evaluated, beside the last one; the whole step is at each twentieth of its run.
         factor: the photos' own, by which they are smaller: images_4/ at 4.
         seeds: each variant is run with each; gsplat's own is 42.
@@ -77,6 +77,7 @@ class Options:
     out: Path
     variants: tuple[str, ...] = ("stock", "density", "errors", "lm", "sparse")
     steps: int = 7000
+    own_steps: int | None = None
     marks: tuple[int, ...] = (500, 1000, 2000, 3000, 4000, 5000, 6000)
     factor: int = 1
     seeds: tuple[int, ...] = (42,)
@@ -120,7 +121,7 @@ def train(options: Options, scene: Path, variant: str, seed: int, gpu: str) -> d
     run = {"scene": scene.name, "variant": variant, "steps": options.steps, "batch": batch, "seed": seed}
     steps, marks = options.steps, options.marks
     if whole_step.EDITS in VARIANTS[variant]:
-        steps = own_length(scene, options.steps)
+        steps = options.own_steps or own_length(scene, options.steps)
         marks = (*marks, *(steps * part // 20 for part in range(1, 20)))
     marks = sorted({mark for mark in (*marks, steps) if 0 < mark <= steps})
     paths = [*map(str, options.paths), "" if options.python else os.environ.get("PYTHONPATH", "")]

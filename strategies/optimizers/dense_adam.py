@@ -11,6 +11,7 @@ from torch.optim.adam import adam
 
 from turbogs_plugin.engine.moments import check_state
 from turbogs_plugin.engine.reference.update import clipped, finite_gradients
+from turbogs_plugin.errors import require
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, RowUpdate, Step
@@ -65,6 +66,7 @@ class DenseAdam:
 
     @torch.no_grad()
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
+        require("counts" in vars(self), "optimizer", type(self).__name__, "set up, by setup(gaussians) before step")
         gradients = gradients.over_views()
         finite, touched = finite_gradients(gradients), gradients.touched
         self.skipped += (touched & ~finite).sum()

@@ -10,7 +10,7 @@ from torch import Tensor
 from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
 from turbogs_plugin.engine.reference.update import apply_update
 from turbogs_plugin.engine.rules import MomentLMParams, UpdateRule
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.errors import require
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.types import GaussianGradients, Gaussians, RowUpdate, Step
@@ -65,8 +65,7 @@ class SparseAdam:
         return UpdateRule(self.learning_rates.at(step), self.beta1, self.beta2, self.eps, self.lm)
 
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
-        if "moments" not in vars(self):
-            raise InputError("the optimizer has no moments: call setup(gaussians) before its first step")
+        require("moments" in vars(self), "optimizer", type(self).__name__, "set up, by setup(gaussians) before step")
         apply_update(self.rule(step), gaussians, gradients, self.moments)
 
     def apply(self, update: RowUpdate) -> None:

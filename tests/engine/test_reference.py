@@ -313,3 +313,18 @@ def test_shares_of_the_loss_are_of_the_filled_slots():
         shares.append(screen.parameter_gradients(rows=True).view_losses)
     torch.testing.assert_close(*shares)
     assert shares[0].any()
+
+
+def test_other_cameras_and_gradients_that_are_wanted_are_refused_by_name():
+    gaussians, cameras = make_gaussians(5), make_cameras([(20, 20)] * 3)
+    samples = dense_samples(cameras, [0, 1])
+    wanted = gaussians.map(lambda value: value.clone().requires_grad_())
+    for model, wrong, words in (
+        (gaussians, cameras, r"cameras are of views \[0, 1, 2\], samples of \[0, 1\]: give cameras.select"),
+        (gaussians, cameras.select([1, 0]), r"cameras are of views \[1, 0\], samples of \[0, 1\]"),
+        (wanted, cameras.select([0, 1]), "rasterize makes no graph"),
+    ):
+        with pytest.raises(InputError, match=words):
+            rasterize(model, wrong, samples)
+    with torch.no_grad():
+        rasterize(wanted, cameras.select([0, 1]), samples)

@@ -177,3 +177,14 @@ def test_steps_states_and_rows_that_do_not_fit_are_refused():
 def test_our_length():
     assert TurboStep.proposed_steps(65) == 3900 and TurboStep.proposed_steps(3) == 2000
     assert TurboStep(make_splats(), make_views()).max_steps == 2000
+
+
+def test_iterations_that_had_too_little_memory_are_made_again(monkeypatch):
+    """Also before a state is given away: it lacks none."""
+    turbo = TurboStep(make_splats(), make_views(), max_steps=STEPS, overrides=SMALL)
+    lost = iter((0, 0, 1, 0, 2, 0, 0))
+    monkeypatch.setattr(turbo.trainer.engine, "settle", lambda wait=False: next(lost, 0))
+    for step in range(3):
+        turbo.step(step)
+        assert turbo.trainer.iteration == step + 1
+    assert turbo.state_dict()["trainer"]["iteration"] == 3 and list(lost) == []

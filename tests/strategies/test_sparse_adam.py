@@ -191,6 +191,12 @@ def test_state_follows_rows(cls):
 
 
 @pytest.mark.parametrize("cls", [*OPTIMIZERS, DenseAdam])
+def test_a_step_before_setup_is_refused_by_name(cls):
+    with pytest.raises(InputError, match="set up, by setup"):
+        cls().step(make_gaussians(3), make_gradients(1, 3, 0), STEP)
+
+
+@pytest.mark.parametrize("cls", [*OPTIMIZERS, DenseAdam])
 def test_resumed_is_bit_identical_and_another_models_state_is_refused(cls):
     """Six steps at once, and with the state taken over by another optimizer after three."""
     whole, parts = make_gaussians(6, dtype=torch.float32), make_gaussians(6, dtype=torch.float32)

@@ -192,7 +192,7 @@ class SharedOptimizer:
                 raise InputError(
                     f"{option} differ between the members of one shared update: {values}; expected one value"
                 )
-        rates = {name: float(group["lr"]) for name, group in groups.items()}
+        rates: dict[str, Any] = {name: float(group["lr"]) for name, group in groups.items()}
         (beta1, beta2), eps = betas["means"], epsilons["means"]
         check_moments_config(beta1, beta2, eps)
         self.optimizer.learning_rates = LearningRates(**rates, means_final=rates["means"], batch_scale=1.0)

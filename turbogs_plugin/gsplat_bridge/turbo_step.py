@@ -49,7 +49,7 @@ class StepInfo:
     """What a step gives. The host waits for a GPU where a number is read, and nowhere else.
 
     Args:
-        loss: [] of the samples, before the step's update.
+        loss: [] float32 of the samples, before the step's update.
         num_gaussians: after the step.
         num_samples: pixels of the step, empty slots among them.
     """
@@ -135,12 +135,11 @@ class TurboStep:
         self.trainer = HostTrainer(self, settings, world, device)
         if rates:
             require_keys(self.optimizers, rates, "optimizers", "rates are of parameters whose optimizer is given")
-            if "learning_rates" not in settings.optimizer:
-                raise InputError(
-                    f"optimizer.type '{settings.optimizer['type']}' has no learning rates: leave out rates"
-                )
-            own_rates = self.trainer.optimizer.learning_rates = HostRates(**vars(self.trainer.optimizer.learning_rates))
-            own_rates.host = {role_of(name, self.splats): self.optimizers[name] for name in rates}
+            kind, known = settings.optimizer["type"], "learning_rates" in settings.optimizer
+            require(known, "rates", rates, f"left out, as optimizer.type '{kind}' has no learning rates")
+            mixed = HostRates(**settings.optimizer["learning_rates"])
+            mixed.host = {role_of(name, self.splats): self.optimizers[name] for name in rates}
+            self.trainer.optimizer.learning_rates = mixed
         self.steps, self.max_steps, self._begun = 0, self.trainer.iterations, False
 
     @staticmethod
@@ -162,21 +161,25 @@ class TurboStep:
         if step != self.steps or step >= self.max_steps:
             raise InputError(f"step is {step}: expected {self.steps}, the next one, below max_steps = {self.max_steps}")
         trainer = self.trainer
-        self._begin() if not self._begun else self._take_changes()
-        while trainer.iteration <= step:  # iterations that had too little memory are made again
-            trainer.step()
-            if step + 1 == self.max_steps:
-                trainer.repeat_lost(wait=True)
+        if self._begun:
+            self._take_changes()
+        else:
+            self._begin()
         self.steps = step + 1
+        while trainer.iteration < self.steps:
+            trainer.step()
         if self.steps == self.max_steps:
+            self._catch_up()
             trainer.conclude()
         output, colors, truth = trainer.seen
-        return StepInfo(output.loss, len(trainer.gaussians), len(truth.samples), colors, truth)
+        loss = output.loss.to(torch.float32, copy=True)  # an engine may use the memory of its own again
+        return StepInfo(loss, len(trainer.gaussians), len(truth.samples), colors, truth)
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors and numbers for the host's checkpoint, beside its own parameters. A resume is exact on a CPU."""
         if not self._begun:
             self._begin()
+        self._catch_up()
         self.trainer.complete()
         numbers = {"steps": self.steps, "max_steps": self.max_steps, "seed": self.trainer.config.train.seed}
         return {**numbers, "trainer": self.trainer.state_dict()}
@@ -200,11 +203,18 @@ class TurboStep:
         except (KeyError, TypeError, IndexError, RuntimeError, ValueError) as error:
             raise InputError(f"the state does not fit this TurboStep: {error}") from None
         self.trainer.config.train.seed, self.steps, self._begun = state["seed"], state["steps"], True
-        for name in self.splats:
-            if len(self.splats[name]) != count and name in self.optimizers:
-                self.optimizers[name].state.clear()
-        source = torch.arange(count, device=self.trainer.device)
+        before = len(self.splats["means"])
+        for name in self.optimizers if before != count else ():
+            self.optimizers[name].state.clear()
+        source = torch.arange(count, device=self.trainer.device).clamp(max=before - 1)
         self._follow(RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}))
+
+    def _catch_up(self) -> None:
+        """Make the iterations again that had too little memory, until none is missing."""
+        self.trainer.repeat_lost(wait=True)
+        while self.trainer.iteration < self.steps:
+            self.trainer.step()
+            self.trainer.repeat_lost(wait=True)
 
     def _begin(self) -> None:
         """Begin with the host's present Gaussians, and a backdrop behind them if one is wanted."""
