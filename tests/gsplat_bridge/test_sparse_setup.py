@@ -95,5 +95,5 @@ def test_what_is_no_image_of_three_colours_is_refused_by_name(image, found):
     trainset = [{"image": torch.zeros(20, 30, 3)}, {"image": image}]
     with pytest.raises(InputError, match=rf"^trainset\[1\]\['image'\] is {found}: expected a tensor \[H, W, 3\]"):
         maps_of_photos(trainset)
-    with pytest.raises(InputError, match=r"the sparse swap needs whole images, trainset.patch_size is 8"):
+    with pytest.raises(InputError, match=r"trainset needs whole images, its patch_size is 8"):
         maps_of_photos(Photos(torch.zeros(2, 8, 8, 3), patch_size=8))

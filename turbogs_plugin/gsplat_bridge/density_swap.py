@@ -183,9 +183,7 @@ class TurboDensityStrategy(DefaultStrategy):
             infos = [each for each in infos if rows_of(each) in (None, len(gaussians))]
         for each in infos:
             window = self._accumulate(state, each, len(gaussians))
-        if not infos:
-            return
-        if not self._due(step):
+        if not infos or not self._due(step):
             return
         controller = self._controller(step)
         controller.setup(gaussians)
@@ -301,7 +299,7 @@ def apply_row_update(
         if name in optimizers:
             optimizer = optimizers[name]
             rows = optimizer.state.pop(parameter, {})
-            for key in [key for key, kept in rows.items() if key != COUNT and kept.dim() and len(kept) == count]:
+            for key in [key for key, kept in rows.items() if key != COUNT and _of_rows(kept, count)]:
                 rows[key] = update.apply_state(rows[key])
                 if role in update.reset:
                     rows[key].zero_()
@@ -309,8 +307,13 @@ def apply_row_update(
             for group in optimizer.param_groups:
                 group["params"] = [replaced]
     for key, value in state.items():  # as by gsplat's operations, a host's own values go from parent to child
-        if isinstance(value, Tensor) and value.dim() > 0 and len(value) == count:
+        if _of_rows(value, count):
             state[key] = update.apply_state(value) if key in _SUMS else value[update.source]
     if scene is not None:  # any choice of rows is a copy of them behind the old ones, which then go
         scene.on_duplicate(update.source)
         scene.on_remove(torch.arange(count + len(update.source), device=update.source.device) < count)
+
+
+def _of_rows(value: Any, count: int) -> bool:
+    """Whether a value has a row for each of `count` Gaussians."""
+    return isinstance(value, Tensor) and value.dim() > 0 and len(value) == count

@@ -34,14 +34,14 @@ def read_items(trainset: Any, name: str, white: float, convert: Callable[[Tensor
         raise InputError(f"{name} is a {type(trainset).__name__}: expected a data set with items by number, no loader")
     if getattr(trainset, "patch_size", None) is not None:
         raise InputError(
-            f"the sparse swap needs whole images, {name}.patch_size is {trainset.patch_size}: leave patch_size out, as "
-            "samples are few pixels of a whole image already"
+            f"{name} needs whole images, its patch_size is {trainset.patch_size}: leave patch_size out, as samples are "
+            "few pixels of a whole image already"
         )
 
     def read(number: int) -> dict[str, Any]:
         item, place = trainset[number], f"{name}[{number}]"
         require_keys(
-            item if isinstance(item, dict) else {}, ("image",), place, "expected an item as gsplat's data sets"
+            item if isinstance(item, dict) else {}, ("image",), place, "expected items as of gsplat's data sets"
         )
         image = item["image"]
         if not isinstance(image, Tensor) or image.dim() != 3 or image.shape[-1] != 3:

@@ -174,6 +174,7 @@ class SharedOptimizer:
         moments = self._pack(gaussians)
         self.optimizer.moments = moments
         self.optimizer.step(gaussians, _one_row(given, self._shares(gaussians)), Step(0, 1, 1))
+        self._shown = []
         for place, moment in self._moments(moments):
             moment.copy_(place.reshape(moment.shape))
         members["means"].checked_state()[COUNT] += 1

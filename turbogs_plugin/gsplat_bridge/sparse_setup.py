@@ -36,7 +36,6 @@ def sparse_budget(num_views: int, batch_size: int | None = None, options: Any = 
         num_views: V, training views.
         batch_size: K, where the trainer has settled it; None takes `DEFAULT_VIEWS`, or V if that is less. Give the
             data loader `views` of the result.
-
         options: of the trainer, as gsplat's `Config`: those that need whole images are refused.
 
     Raises:
