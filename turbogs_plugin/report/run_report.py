@@ -41,7 +41,7 @@ def write_report(run: RunSession) -> Path:
     strips = min(len(run.test), STRIPS)
     view_errors = trainer.maps.view_means()
     worst = [int(view) for view in np.argsort(-view_errors)[:STRIPS] if doubted(view_errors)[view]]
-    shown = [("test", run.test, look, range(strips))]
+    shown = [("test", run.test, look, list(range(strips)))]
     shown += [("doubted", trainer.views, trainer.look(trainer.views.names), worst)] if worst else []
     for kind, views, seen, view_ids in shown:
         for view_id in view_ids:
