@@ -66,6 +66,17 @@ def test_reduced_copies_are_used_only_where_all_fit(tmp_path, case):
     assert scene.train.cameras.sizes[0].tolist() == [20, 12]
 
 
+def link_photos(folder: Path, each: bool = False) -> None:
+    """Photos are links to what is not there, or lie in one."""
+    for path in sorted((folder / "images").iterdir()):
+        path.unlink()
+        if each:
+            path.symlink_to(Path("/gone") / path.name)
+    if not each:
+        (folder / "images").rmdir()
+        (folder / "images").symlink_to("/gone")
+
+
 DEEP, WRONG = Image.fromarray(np.full((24, 40), 3000, dtype=np.uint16)), Image.new("RGB", (24, 40))
 """Photos of 16 bits, and of another size than their camera's."""
 
@@ -83,6 +94,11 @@ def remove_photos(folder: Path) -> None:
             r"has no points3D\.bin: bring back what is missing, or take that folder away and find",
         ),
         (remove_photos, r"sparse/0 names 9 photos, of which 7 are missing in .*cup \(photo02.png, .*\): at least 3"),
+        (
+            lambda folder: link_photos(folder, each=True),
+            "photo00.png is a link to /gone/photo00.png, which",
+        ),
+        (link_photos, "images is a link to /gone, which is not there: copy that here"),
         (lambda folder: (folder / "images/photo03.png").write_bytes(b"\xff"), "cannot read the photo .*photo03.png"),
         (
             lambda folder: WRONG.save(folder / "images/photo03.png"),

@@ -4,6 +4,7 @@ Each shows painted points, so that photos, intrinsics and poses must belong toge
 """
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,9 @@ def test_nerfstudio_and_instant_ngp(tmp_path, model):
     write_photos(tmp_path / "poster/images_4", camera, names, 4)
     if model:
         write_model(tmp_path / "poster" / model, camera, names, ".txt" if "text" in model else ".bin")
+    else:
+        shutil.copytree(tmp_path / "poster", tmp_path / "reduced", ignore=shutil.ignore_patterns("images"))
+        assert load_scene(tmp_path / "reduced").train.cameras.sizes[0].tolist() == [60, 40]
     for factor in (1, 4):
         scene = load_scene(tmp_path / "poster", factor)
         require_painted(scene)

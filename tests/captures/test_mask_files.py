@@ -68,13 +68,26 @@ def test_a_nonzero_pixel_counts(capture, convention, mode):
     assert scene.notes[-1] == "8 photos have masked pixels, 49.9% of them"
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".jpeg", ".JPG", ".JPEG"])
-def test_masks_are_jpegs_too(capture, suffix):
+@pytest.mark.parametrize(
+    "file",
+    [
+        *("masks/{stem}.jpg", "masks/{stem}.JPEG", "masks/{stem}.PNG", "masks/{stem}_mask.png"),
+        *("masks/{name}.mask.png", "images/{name}.mask.png"),  # RealityScan's
+    ],
+)
+def test_names_of_masks(capture, file):
     (capture / "masks").mkdir()
     for photo in photos_of(capture):
         mask = Image.fromarray(np.where(half_mask() > 1, np.uint8(255), np.uint8(0)))
-        mask.save(capture / "masks" / f"{photo.stem}{suffix}", format="JPEG")
+        mask.save(capture / file.format(stem=photo.stem, name=photo.name))
     assert_masked(load_scene(capture).train, half_mask() > 1)
+
+
+@pytest.mark.parametrize("name", ["{}_mask.png", "dynamic_mask_{}.png"])
+def test_masks_beside_photos_that_mean_one_or_the_other_are_said(capture, name):
+    write_masks(capture, [name.format(photo.stem) for photo in photos_of(capture)], half_mask(), "images")
+    scene = load_scene(capture)
+    assert scene.train.masks is None and scene.notes[-1].startswith("8 masks beside the photos are not used (")
 
 
 def test_photos_without_a_mask_are_whole(capture):

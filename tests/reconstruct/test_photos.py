@@ -8,6 +8,7 @@ from helpers.refusals import assert_refused
 from PIL import Image
 
 from turbogs_plugin.captures.decoding import load_photos, photo_sizes
+from turbogs_plugin.captures.photo_files import unread
 from turbogs_plugin.reconstruct import solver
 from turbogs_plugin.reconstruct.photos import place_photos, read_photos
 
@@ -22,10 +23,10 @@ def picture(seed: int = 0, size: tuple[int, int] = (48, 32)) -> Image.Image:
     return Image.fromarray(blocks.repeat(16, axis=0).repeat(16, axis=1))
 
 
-def stored(form: str = "JPEG") -> bytes:
+def stored(form: str = "JPEG", **options) -> bytes:
     """A photo's file."""
     file = io.BytesIO()
-    picture().save(file, form)
+    picture().save(file, form, **options)
     return file.getvalue()
 
 
@@ -140,12 +141,29 @@ def test_names_have_no_spaces_and_folders_are_kept(tmp_path):
     ]
 
 
+def test_maps_of_photos_are_no_photos(tmp_path):
+    maps = ("0.jpg.mask.png", "1_mask.png", "2-depth.PNG", "r_0_normal_0001.png", "dynamic_mask_1.png", "1_alpha.png")
+    others = ("depth/0.jpg", "normals/1.png", "sky_masks/2.png", "masks/0.png")
+    photos = ("0.jpg", "1.jpg", "2.jpg", "r_0.png", "mask_9.jpg", "left/depth_1.png")  # the last are of no photo here
+    for name in (*maps, *others, *photos):
+        write(tmp_path / name)
+    assert {photo.name for photo in read_photos(tmp_path)} == set(photos)
+    assert unread(tmp_path).split("; ") == [
+        "5 files are masks or maps of photos by their names, no photos (1_alpha.png)",
+        *(f"{name}/ holds no photos by its name" for name in ("depth", "normals", "sky_masks")),
+    ]
+
+
+PANORAMA = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
         ({}, "has 0 photos: at least 3"),
         ({"IMG_1.HEIC": b"x"}, r"has 0 photos \(1 file is of a kind that is not read \(IMG_1.HEIC\)"),
         ({"3.jpg": stored()[:-200]}, "cannot read the photo .*3.jpg.*replace it"),
+        ({"5.jpg": stored(xmp=PANORAMA)}, "5.jpg is a panorama by its XMP .*: cut it into perspective photos"),
         ({"5.jpg": stored("GIF")}, "5.jpg has GIF inside, .*: convert it to JPEG"),
         ({"5.png": Image.fromarray(np.zeros((32, 48), dtype=np.uint16))}, "5.png has more than 8 bits"),
         ({"a b.jpg": picture(), "a_b.jpg": picture()}, "2 photos .*'a_b.jpg' without spaces"),

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from turbogs_plugin.captures.capture import Capture, require_printable
-from turbogs_plugin.captures.photo_files import IMAGES, NAMED_SUFFIXES, REDUCED
+from turbogs_plugin.captures.photo_files import IMAGES, NAMED_SUFFIXES, REDUCED, maps_beside, unread
 from turbogs_plugin.captures.starting_points import NUM_RANDOM_POINTS, points_in_views
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import viewmat_of_pose
@@ -39,7 +39,7 @@ def read_llff(scene: Path) -> Capture:
     if len(names) != len(table):
         raise InputError(
             f"{source} has {len(table)} poses but {folder} has {len(names)} photos: bring back those that are missing, "
-            f"take out those without a pose (COLMAP leaves out what it cannot place), or {AGAIN}"
+            f"take out those without a pose, or {AGAIN}{f' ({unread(folder)})' if unread(folder) else ''}"
         )
     for name in names:
         require_printable(name, folder)
@@ -94,4 +94,5 @@ def _read_table(source: Path) -> np.ndarray:
 def _names_of(folder: Path) -> list[str]:
     """The names of a folder's photos, in order."""
     files = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [f.name for f in files if f.suffix.lower() in NAMED_SUFFIXES and f.name[0] != "." and f.is_file()]
+    files = [f for f in files if f.suffix.lower() in NAMED_SUFFIXES and f.name[0] != "." and f.is_file()]
+    return sorted(file.name for file in set(files).difference(maps_beside(files)))

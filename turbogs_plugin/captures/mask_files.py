@@ -7,7 +7,7 @@ undistorted or reduced counts if all pixels that it is made of do.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -15,14 +15,23 @@ from PIL import Image
 
 from turbogs_plugin.captures.capture import Capture
 from turbogs_plugin.captures.decoding import OPAQUE_SUFFIXES, decoding_threads, is_transparent, opened_image
-from turbogs_plugin.captures.photo_files import MASKS, find_photos
+from turbogs_plugin.captures.photo_files import MASK_OF_NAME, MASKS, files_below, find_photos, maps_beside, plain
 from turbogs_plugin.captures.undistort import Lens
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks
 
 FOLDER = "masks"
 CONVENTIONS = "NAME.png, NAME.EXTENSION.png or NAME.jpg"
-JPEG_SUFFIXES = (".jpg", ".jpeg", ".JPG", ".JPEG")
+FORMS = (
+    "{stem}.png",
+    "{name}.png",
+    f"{{name}}{MASK_OF_NAME}",
+    "{stem}_mask.png",
+    "{name}",
+    "{stem}.jpg",
+    "{stem}.jpeg",
+)
+"""Names of masks in their folder, in any letters, the first that is there before others."""
 HALF = 128
 """Value from which a pixel of a JPEG counts, whose compression leaves no exact zeros."""
 
@@ -30,7 +39,7 @@ HALF = 128
 def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[list[Path | None], str]:
     """The file of each photo's mask, None where there is none, and what to tell the user of it.
 
-    Masks that the capture names come first. Others are found by `in_folders`, in the capture or beside the folder of
+    Masks that the capture names come first. Others are found by `mask_finder`, in the capture or beside the folder of
     its photos. For photos of ``images_4``, masks of ``masks_4`` come first.
 
     Args:
@@ -40,10 +49,11 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
     names = [f"{FOLDER}{reduced[0]}", FOLDER] if reduced else [FOLDER]
     parents = dict.fromkeys((scene, capture.photo_folder.parent, capture.photo_folder))
     folders = [parent / name for name in names for parent in parents if (parent / name).is_dir()]
-    found = [file or in_folders(folders, name) for file, name in zip(capture.mask_files, capture.names, strict=True)]
+    finder = mask_finder(folders, capture.photo_folder)
+    found = [file or finder(name) for file, name in zip(capture.mask_files, capture.names, strict=True)]
     if not (files := [file for file in found if file is not None]):
         unused = (f"{folder} is not used: it has no {CONVENTIONS} of a photo" for folder in folders)
-        return found, next(unused, "") or misnamed(parents)
+        return found, next(unused, "") or misnamed(parents) or _beside(photos)
     whole = f"; {len(found) - len(files)} photos without one are whole" if len(files) < len(found) else ""
     return found, f"masks of {len(files)} of {len(found)} photos, as {files[0]}{whole}"
 
@@ -58,11 +68,30 @@ def misnamed(parents: Iterable[Path]) -> str:
     return ""
 
 
-def in_folders(folders: Sequence[Path], photo: str) -> Path | None:
-    """The mask of a photo in the first of these folders that has one; `photo` is relative to the folder of photos."""
-    stem = PurePosixPath(photo).with_suffix("")
-    names = (f"{stem}.png", f"{photo}.png", photo, *(f"{stem}{suffix}" for suffix in JPEG_SUFFIXES))
-    return next((folder / name for folder in folders for name in names if (folder / name).is_file()), None)
+def _beside(photos: Sequence[Path]) -> str:
+    """A note on masks that lie beside photos; empty where there is none."""
+    files = [file for folder in dict.fromkeys(photo.parent for photo in photos) for file in sorted(folder.iterdir())]
+    if not (masks := [file for file in maps_beside(files) if "mask" in file.name.lower()]):
+        return ""
+    return (
+        f"{len(masks)} masks beside the photos are not used ({masks[0].name}): put them into {FOLDER}/ as "
+        f"{CONVENTIONS}, nonzero where a pixel counts"
+    )
+
+
+def mask_finder(folders: Sequence[Path], photos: Path) -> Callable[[str], Path | None]:
+    """A function from a photo's name in the folder `photos` to its mask in the first of `folders` that has one, or
+    beside the photo by RealityScan's convention; None where there is none."""
+    exact = [{place.as_posix(): folder / place for place in files_below(folder)} for folder in folders]
+    inside = [{plain(name): file for name, file in files.items()} | files for files in exact]
+
+    def find(name: str) -> Path | None:
+        stem, own = PurePosixPath(name).with_suffix(""), photos / f"{name}{MASK_OF_NAME}"
+        keys = [form.format(stem=stem, name=name) for form in FORMS]
+        found = (files[key] for files in inside for key in (*keys, *map(plain, keys)) if key in files)
+        return next(found, own if own.is_file() else None)
+
+    return find
 
 
 def load_masks(

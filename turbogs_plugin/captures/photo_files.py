@@ -6,7 +6,7 @@ import os
 import re
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -17,17 +17,33 @@ from turbogs_plugin.errors import InputError
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 """Suffixes of photos that both pillow and COLMAP read."""
 OTHER_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2")
-"""Suffixes of photos that at least one of them does not read."""
+"""Suffixes of photos that at least one of them does not read, and that may stand for others (`_stem`)."""
 NAMED_SUFFIXES = (*PHOTO_SUFFIXES, ".webp", ".avif", ".jp2")
 """Suffixes of files that may stand for a photo that is not where a capture names it, as Pillow reads them."""
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".insv")
-FRAMES_OF_VIDEO = "ffmpeg -i VIDEO -vf fps=2 -q:v 2 PHOTOS/%05d.jpg"
-MASKS = "masks?(_images)?"
+UNREAD = {
+    "convert to JPEG": (*OTHER_SUFFIXES, ".exr", ".hdr", ".raf", ".raw", ".pef", ".jfif", ".jp2", ".gif", ".psd"),
+    "it is of a 360 degree camera: export flat views of it": (".insp", ".insv", ".360"),
+    "unpack it": (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"),
+    "it is Record3D's: 'ns-process-data record3d' makes a capture of it": (".r3d",),
+    "it is a video: take photos out of it, as by  ffmpeg -i VIDEO -vf fps=2 -q:v 2 PHOTOS/%05d.jpg": (
+        *(".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"),
+    ),
+}
+"""Suffixes of files that are not read, by what to do with them."""
+MASKS = "(.*[_. -])?(mask|matte|segmentation)s?(_images)?"
 """Names of folders of masks, in any letters; one of them is read (`mask_files.FOLDER`)."""
-NO_PHOTOS = re.compile(rf"\..*|images_\d+|{MASKS}", re.IGNORECASE)
-"""Folders without photos: hidden ones, copies reduced by a factor (``images_4``), masks."""
-OTHER_IMAGES = re.compile(r"(depth|normal|semantic|segmentation|confidence)s?|.*[_-]masks?", re.IGNORECASE)
-"""Folders of images that have the photos' names and are none."""
+MASK_OF_NAME = ".mask.png"
+"""RealityScan's masks are ``NAME.EXTENSION.mask.png``, beside the photos, too."""
+_MAPS = "(?:mask|matte|depth|disparity|normal|semantic|segmentation|confidence)s?(?:[_-]?(?:map|image|vi[sz])s?)?"
+NO_PHOTOS = re.compile(rf"\..*|images_\d+|(?:.*[_. -])?{_MAPS}(?:_\d+)?", re.IGNORECASE)
+"""Folders without photos: hidden ones, copies reduced by a factor (``images_4``), masks, maps of depth and others."""
+READ_SO = re.compile(r"\..*|(images|masks)_\d+|masks")
+"""Folders among these that need no word: they are read for what they are, or hidden."""
+MAPS_OF = [
+    re.compile(form, re.IGNORECASE)
+    for form in (rf"(.+?)[._ -]?(?:{_MAPS}|alpha)(?:[_-]?\d+)?", rf"(?:dynamic_)?{_MAPS}[._ -](.+)")
+]
+"""Stems of files that are no photos where the photo lies beside them that they are made from (the group)."""
 PHOTO_DEPTH = 1
 """Photos are looked for in a folder and in the folders in it. The photos of several captures beside each other lie
 deeper, in the ``images`` of each."""
@@ -44,22 +60,53 @@ def find_photos(folder: Path) -> tuple[Path, list[Path]]:
         The folder that their names are relative to; the photos in the order of their names.
     """
     for place in (folder / IMAGES, folder):
-        if photos := [path for path in _files(place, PHOTO_DEPTH) if path.suffix.lower() in PHOTO_SUFFIXES]:
+        files = [path for path in _files(place, PHOTO_DEPTH) if path.suffix.lower() in PHOTO_SUFFIXES]
+        if photos := set(files).difference(maps_beside(files)):
             break
     return place, sorted(photos, key=lambda path: path.relative_to(place).as_posix())
 
 
-def unread(path: Path) -> str:
-    """Advice on photos and videos that are not read, of the file `path` or in a folder; empty where there are none."""
-    files = _files(path, PHOTO_DEPTH) if path.is_dir() else [path] if path.is_file() else []
-    photos = [file for file in files if file.suffix.lower() in OTHER_SUFFIXES]
-    videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
-    if photos:
-        which = "1 file is" if len(photos) == 1 else f"{len(photos)} files are"
-        return f"{which} of a kind that is not read ({photos[0].name}): convert to JPEG"
-    if videos:
-        return f"{videos[0].name} is a video: take photos out of it, as by  {FRAMES_OF_VIDEO}"
-    return ""
+def maps_beside(files: Iterable[Path]) -> list[Path]:
+    """Files among these that are masks or maps of others: ``a.jpg.mask.png`` or ``a_depth.png`` beside ``a.jpg``."""
+    files = list(files)
+    bases = {file.parent / base for file in files for base in (file.name.lower(), file.stem.lower())}
+    matches = ((file, form.fullmatch(file.stem.lower())) for file in files for form in MAPS_OF)
+    return list(dict.fromkeys(file for file, match in matches if match and file.parent / match[1] in bases))
+
+
+def unread(path: Path, every: bool = False) -> str:
+    """What is not read of the file `path` or in a folder, and what to do; empty where there is nothing.
+
+    Args:
+        every: also files of kinds that captures have nothing to do with.
+    """
+    entries = [path, *(path.iterdir() if path.is_dir() else ()), *((path / IMAGES).glob("*"))]
+    said = [link for entry in sorted(entries) if (link := broken_link(entry))][:1]
+    files = [path] if path.is_file() else _files(path, PHOTO_DEPTH)
+    for advice, suffixes in UNREAD.items():
+        if some := [file.name for file in files if file.suffix.lower() in suffixes]:
+            which = "1 file is" if len(some) == 1 else f"{len(some)} files are"
+            said.append(f"{which} of a kind that is not read ({some[0]}): {advice}")
+    maps = maps_beside(file for file in files if file.suffix.lower() in PHOTO_SUFFIXES)
+    if maps := [file for file in maps if not file.name.endswith(MASK_OF_NAME)]:
+        said.append(f"{len(maps)} files are masks or maps of photos by their names, no photos ({maps[0].name})")
+    said += [f"{folder.name}/ holds no photos by its name" for folder in _folders_of_maps(path)]
+    if every and files and not said:
+        said.append(f"{named([file.name for file in files])} cannot be read as photos")
+    return "; ".join(said)
+
+
+def _folders_of_maps(folder: Path) -> list[Path]:
+    """Folders of images in a folder that hold none by their names, but for masks that are read and reduced copies."""
+    entries = sorted(folder.iterdir()) if folder.is_dir() else []
+    others = (entry for entry in entries if NO_PHOTOS.fullmatch(entry.name) and not READ_SO.fullmatch(entry.name))
+    return [entry for entry in others if any(file.suffix.lower() in NAMED_SUFFIXES for file in _files(entry, 0))]
+
+
+def broken_link(path: Path) -> str:
+    """A line where a path, or a folder that it lies in, is a link to what is not there; empty where it is none."""
+    broken = (part for part in (path, *path.parents) if part.is_symlink() and not part.exists())
+    return next((f"{part} is a link to {os.readlink(part)}, which is not there: copy that here" for part in broken), "")
 
 
 def _files(folder: Path, depth: int) -> list[Path]:
@@ -91,8 +138,13 @@ def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | 
         InputError: a name that cannot be printed.
     """
     require_printable(name, source)
-    forms = ((PurePosixPath(folder) / end).as_posix() for end in _ends(name))
-    return next((form for form in forms if (scene / form).is_file()), None)
+    return next((form for form in _forms(name, folder) if (scene / form).is_file()), None)
+
+
+def _forms(name: str, folder: str) -> Iterator[str]:
+    """The paths in a scene that a name may mean in a folder; ``images_2/a.png`` is a copy of ``images/a.png``."""
+    inner = PureWindowsPath(name).as_posix().removeprefix(f"{IMAGES}/") if folder in REDUCED else name
+    return ((PurePosixPath(folder) / end).as_posix() for end in _ends(inner))
 
 
 @dataclass(frozen=True)
@@ -152,12 +204,15 @@ def find_named(
     pairs = sorted((moved.get(place) or path or "", place) for place, path in enumerate(found))
     pairs = [(path, place) for path, place in pairs if path]
     absent = [written[place] for place in missing if place not in moved]
+    links = (broken_link(scene / form) for name in absent[:1] for place in folders for form in _forms(name, place))
+    link = next(filter(None, links), "")
     if absent and len(pairs) < FEWEST_PHOTOS:
         raise InputError(
             f"{source} names {len(names)} photos, of which {len(absent)} are missing in {scene} ({named(absent)}): at "
-            f"least {FEWEST_PHOTOS} are needed; copy the photos there"
+            f"least {FEWEST_PHOTOS} are needed; {link or 'copy the photos there'}"
         )
     note = f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {named(absent, most=1)}"
+    note += f"; {link}" if link else ""
     inner = {path.split("/")[0] if "/" in path else "" for path, _ in pairs}
     folder = scene / inner.pop() if len(inner) == 1 else scene
     return FoundPhotos(
@@ -182,29 +237,33 @@ Index = dict[str, list[PurePosixPath]]
 """Paths of files relative to a scene, by their stems (`_stem`)."""
 
 
-def _plain(text: str) -> str:
+def plain(text: str) -> str:
+    """A name in one form of Unicode and small letters."""
     return unicodedata.normalize("NFC", text).lower()
 
 
 def _stem(name: str) -> str:
     """A photo's name without folders and suffix, in plain letters. What is no suffix of an image is part of it."""
     path = PureWindowsPath(name)
-    return _plain(path.stem if path.suffix.lower() in (*NAMED_SUFFIXES, *OTHER_SUFFIXES) else path.name)
+    return plain(path.stem if path.suffix.lower() in (*NAMED_SUFFIXES, *OTHER_SUFFIXES) else path.name)
 
 
 def _index(scene: Path, others: Collection[str]) -> Index:
     """The files of a scene that may be photos, but for `others`."""
     files: Index = defaultdict(list)
-    for folder, inner, inside in os.walk(scene, followlinks=True):
-        place = PurePosixPath(Path(folder).relative_to(scene).as_posix())
-        barred = (name for name in inner if NO_PHOTOS.fullmatch(name) or OTHER_IMAGES.fullmatch(name))
-        inner[:] = sorted(filter(str.isprintable, set(inner).difference(barred)))
-        if len(place.parts) == FOLDER_DEPTH:
-            inner.clear()
-        for file in sorted(inside):
-            if str(place / file) not in others and PurePosixPath(file).suffix.lower() in NAMED_SUFFIXES:
-                files[_stem(file)].append(place / file)
+    for file in files_below(scene, NO_PHOTOS):
+        if str(file) not in others and file.suffix.lower() in NAMED_SUFFIXES:
+            files[_stem(file.name)].append(file)
     return files
+
+
+def files_below(folder: Path, without: re.Pattern | None = None) -> Iterator[PurePosixPath]:
+    """Paths of files relative to a folder that they lie in, `FOLDER_DEPTH` deep; but for folders of some names."""
+    for place, inner, files in os.walk(folder, followlinks=True):
+        at = PurePosixPath(Path(place).relative_to(folder).as_posix())
+        allowed = [name for name in inner if name.isprintable() and not (without and without.fullmatch(name))]
+        inner[:] = sorted(allowed) if len(at.parts) < FOLDER_DEPTH else []
+        yield from (at / file for file in sorted(files) if (Path(place) / file).is_file())
 
 
 def _beside(index: Index, name: str, folders: Sequence[str]) -> list[PurePosixPath]:
@@ -216,7 +275,7 @@ def _beside(index: Index, name: str, folders: Sequence[str]) -> list[PurePosixPa
 def _best(files: Sequence[PurePosixPath], name: str) -> str:
     """The one of these files that a name stands for; empty where it is not clear."""
     path = PureWindowsPath(name)
-    files = [file for file in files if _plain(file.name) == _plain(path.name)] or list(files)
+    files = [file for file in files if plain(file.name) == plain(path.name)] or list(files)
     pairs = [list(zip(reversed(file.parts[:-1]), reversed(path.parts[:-1]), strict=False)) for file in files]
     ends = [len(list(takewhile(lambda both: both[0] == both[1], each))) for each in pairs]
     best = [file for file, end in zip(files, ends, strict=True) if end == max(ends)]

@@ -17,7 +17,7 @@ from PIL.ExifTags import IFD, Base
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, require_printable
 from turbogs_plugin.captures.decoding import decoding_threads, opened_image, require_8_bits
 from turbogs_plugin.captures.kinds import run_folder
-from turbogs_plugin.captures.mask_files import FOLDER, in_folders, require_mask_size
+from turbogs_plugin.captures.mask_files import FOLDER, mask_finder, require_mask_size
 from turbogs_plugin.captures.photo_files import find_photos, unread
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import naming
@@ -25,6 +25,7 @@ from turbogs_plugin.files import naming
 SEPARATORS = re.compile(r"[\s#]")
 FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "BMP")
 """Image formats that COLMAP reads, by content. MPO: a phone's JPEG with a second picture appended."""
+PANORAMA = re.compile(rb"GPano:ProjectionType\s*(=\s*[\"']|>)\s*(equirectangular|cylindrical|cubemap)", re.IGNORECASE)
 KEPT_EXIF = (Base.Make, Base.Model, IFD.Exif, IFD.GPSInfo)
 """EXIF entries that copies which are turned upright keep: what COLMAP reads."""
 JPEG_QUALITY = 95
@@ -123,14 +124,15 @@ def place_masks(folder: Path, place: Path, photos: Sequence[PhotoFile], target: 
         InputError: a mask that is no image, or has not its photo's size.
     """
     folders = [parent / FOLDER for parent in dict.fromkeys((folder, place.parent, place))]
+    find = mask_finder(folders, place)
 
     def put(photo: PhotoFile) -> None:
-        path = in_folders(folders, photo.path.relative_to(place).as_posix())
+        path = find(photo.path.relative_to(place).as_posix())
         if path is None:
             return
         with opened_image(path, "mask") as mask, opened_image(photo.path) as image:
             require_mask_size(path, mask.size, photo.path, photo.size, image.size)
-            inside = path.relative_to(next(each for each in folders if each in path.parents))
+            inside = path.relative_to(next(each for each in (*folders, place) if each in path.parents))
             file = target / plain_name(inside)
             file.parent.mkdir(parents=True, exist_ok=True)
             file.unlink(missing_ok=True)
@@ -157,6 +159,12 @@ def _read(path: Path, name: str) -> PhotoFile:
         if image.format not in FORMATS:
             raise InputError(f"photo {path} has {image.format} inside, which COLMAP does not read: convert it to JPEG")
         require_8_bits(image, path)
+        xmp = [image.info.get(key, b"") for key in ("xmp", "XML:com.adobe.xmp")]
+        if any(PANORAMA.search(text if isinstance(text, bytes) else text.encode()) for text in xmp):
+            raise InputError(
+                f"photo {path} is a panorama by its XMP (GPano): cut it into perspective photos and reconstruct these "
+                "(pycolmap's example panorama_sfm.py does both)"
+            )
         image.draft("RGB", (size[0] // 8, size[1] // 8))  # JPEG: whole, but at an eighth of the size
         image.load()
         status = path.stat()
