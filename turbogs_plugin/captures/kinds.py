@@ -11,7 +11,7 @@ from pathlib import Path
 from turbogs_plugin.captures import llff, transforms
 from turbogs_plugin.captures.capture import Capture
 from turbogs_plugin.captures.colmap import find_model, read_colmap
-from turbogs_plugin.captures.photo_files import find_photos, unread
+from turbogs_plugin.captures.photo_files import IMAGES, find_photos, unread
 from turbogs_plugin.errors import InputError
 
 READERS: dict[str, Callable[[Path], Capture]] = {
@@ -20,6 +20,17 @@ READERS: dict[str, Callable[[Path], Capture]] = {
     llff.FILE: llff.read_llff,
 }
 """Readers of files of cameras that are not COLMAP's, in the order in which they are taken."""
+OTHER_POSES = {
+    "OpenSfM or ODM: ns-process-data odm, or OpenSfM's export_colmap": ("opensfm/*.json", "reconstruction*.json"),
+    "Metashape: export its cameras as COLMAP, or ns-process-data metashape": ("*.xml", "*.psx"),
+    "RealityScan: export as COLMAP, or ns-process-data realitycapture": ("*.csv", "*.rspj", "*.rcproj"),
+    "Bundler, VisualSFM or Pix4D: export as COLMAP": ("*.out", "*.nvm", "*calibrated*camera*.txt"),
+    "openMVG or Meshroom: openMVG_main_openMVG2Colmap, or export as COLMAP": ("sfm_data*", "*.sfm"),
+    "Polycam: ns-process-data polycam": ("*cameras/*.json", "keyframes/*cameras", "mesh_info.json"),
+    "Record3D: ns-process-data record3d": ("metadata.json", "EXR_RGBD"),
+    "the capture of a model: use that capture": ("cameras.json",),
+}
+"""Files that may have cameras and are not read, by what writes them and the way from there to a capture."""
 PARTS_OF_RUN = ("model.ply", "checkpoints", "report")
 """One of these lies beside the config.yaml of a run that has begun."""
 
@@ -73,16 +84,26 @@ def _elsewhere(folder: Path) -> str:
     return run_folder(folder) or (f"{folder} lies in the capture {around}: give that folder" if _kinds(around) else "")
 
 
+def other_poses(folder: Path) -> str:
+    """A line on a file of another program's cameras in a folder, or in the one that its ``images`` are of; or empty."""
+    places = (folder, folder.absolute().parent) if folder.absolute().name == IMAGES else (folder,)
+    patterns = ((place, source, form) for place in places for source, forms in OTHER_POSES.items() for form in forms)
+    files = ((file, source) for place, source, form in patterns for file in sorted(place.glob(form)))
+    return next((f"{file} is not read, which may have cameras of {source}" for file, source in files), "")
+
+
 def _no_capture(scene: Path) -> InputError:
     """The error for a folder that is no capture: what it lacks."""
     if where := _elsewhere(scene):
         return InputError(where)
+    poses, call = other_poses(scene), f"'turbogs reconstruct {shlex.quote(str(scene))} --out SCENE'"
     if photos := find_photos(scene)[1]:
-        return InputError(
-            f"{scene} has {len(photos)} photos and nothing that says where they were taken from: find the cameras by "
-            f"'turbogs reconstruct {shlex.quote(str(scene))} --out SCENE', then use SCENE"
+        known = (
+            f"{poses}; or find them anew" if poses else "nothing that says where they were taken from: find the cameras"
         )
+        return InputError(f"{scene} has {len(photos)} photos and {known} by {call}, then use SCENE")
     return InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
-        f"{', a '.join(READERS)}, nor photos; {unread(scene) or 'give the folder of a capture, or of photos'}"
+        f"{', a '.join(READERS)}, nor photos; "
+        + (poses or unread(scene, every=True) or "give the folder of a capture, or of photos")
     )

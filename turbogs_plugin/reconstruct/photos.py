@@ -65,7 +65,7 @@ def read_photos(folder: Path) -> list[PhotoFile]:
         InputError: no folder, or a run's; fewer than `FEWEST_PHOTOS` photos; names that a capture cannot have; a photo
             that cannot be read (the first in order).
     """
-    reason = f" ({text})" if (text := unread(folder)) else ""
+    reason = f" ({text})" if (text := unread(folder, every=True)) else ""
     if not folder.is_dir():
         raise InputError(f"no such folder of photos: {folder}{reason}")
     if where := run_folder(folder):

@@ -14,6 +14,7 @@ from filelock import FileLock
 
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, named
 from turbogs_plugin.captures.colmap import load_pycolmap
+from turbogs_plugin.captures.kinds import other_poses
 from turbogs_plugin.captures.photo_files import find_photos, unread
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable, write_text_atomically
@@ -110,7 +111,8 @@ def reconstruct(photos: Path, out: Path) -> Solution:
         if solution := _read_solution(out):
             return solution
         with FileLock(out / "reconstruction" / "lock"):  # freed by the system where a process is killed
-            return _read_solution(out) or _reconstruct(found, out, unread(photos))
+            others = "; ".join(filter(None, (unread(photos), other_poses(photos))))
+            return _read_solution(out) or _reconstruct(found, out, others)
     except InputError:
         if new:
             shutil.rmtree(out)
