@@ -132,7 +132,12 @@ def frame(**values):
         (lambda content: content.update(frames=content["frames"][:2]), "2 training images: at least 3"),
         (frame(file_path="./train/r_1"), "names the photo train/r_1 twice"),
         (frame(file_path="./test/r_1"), "names the photo test/r_1 twice"),
-        (frame(transform_matrix=np.diag([2, 2, 2, 1]).tolist()), "r_2' is not a rotation .* scale of the camera"),
+        (
+            lambda content: [
+                each.update(transform_matrix=np.diag([2, 2, 2, 1]).tolist()) for each in content["frames"]
+            ],
+            "r_0' is not a rotation .* scale of the camera",
+        ),
     ],
 )
 def test_what_is_refused(tmp_path, change, words):

@@ -292,3 +292,105 @@ def test_names_of_other_programs_and_machines(tmp_path, written):
     scene = load_scene(folder)
     assert scene.train.names == tuple(f"fot\u00f3{view:02d}.png" for view in range(1, 8))
     np.testing.assert_allclose(scene.train.photos.image(3)[5, 7] * 255, [42, 30, 80], atol=1e-4)
+
+
+def each_line(change):
+    return lambda text: "".join(change(line.split(), line) + "\n" for line in text.splitlines() if line[:1] != "#")
+
+
+def colors_as(form):
+    return each_line(lambda words, line: " ".join([*words[:4], *(form(int(word)) for word in words[4:7]), *words[7:]]))
+
+
+@pytest.mark.parametrize(
+    ("file", "change"),
+    [
+        ("points3D", colors_as(lambda color: f"{color}.0")),
+        ("points3D", colors_as(lambda color: f"{color / 255:.6f}")),
+        ("points3D", each_line(lambda words, line: " ".join(words[:7]))),
+        ("cameras", lambda text: text.replace("40 24", "40.0 2.4e1").replace("PINHOLE", "pinhole")),
+        ("cameras", lambda text: text.encode("utf-16")),
+        ("images", lambda text: text.rstrip("\n") + "\n"),
+        ("images", lambda text: "\ufeff" + text.replace("\n", "\r\n")),
+        ("images", each_line(lambda words, line: line if "photo" in line else "")),
+        ("images", lambda text: each_line(lambda words, line: line)(text).replace("\n\n", "\n")),
+        ("images", lambda text: "\n".join(line for line in text.splitlines() if "photo" in line)),
+        (
+            "images",
+            lambda text: "\n".join("\t".join(line.split()) + " " for line in text.splitlines() if "#" not in line),
+        ),
+        (
+            "images",
+            each_line(lambda words, line: line if "photo" in line else " ".join(f"{float(word):e}" for word in words)),
+        ),
+    ],
+)
+def test_text_as_scripts_and_other_programs_leave_it(tmp_path, file, change):
+    folder = write_capture(tmp_path / "cup", suffix=".txt")
+    for name in ("rigs", "frames"):
+        (folder / f"sparse/0/{name}.txt").unlink()
+    right, path = load_scene(folder), folder / f"sparse/0/{file}.txt"
+    changed = change(path.read_text())
+    path.write_bytes(changed if isinstance(changed, bytes) else changed.encode())
+    scene = load_scene(folder)
+    assert torch.equal(scene.points, right.points) and torch.equal(scene.point_colors, right.point_colors)
+    assert torch.equal(scene.train.cameras.viewmats, right.train.cameras.viewmats)
+    assert torch.equal(scene.train.cameras.Ks, right.train.cameras.Ks) and scene.notes == right.notes
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "words"),
+    [
+        (
+            "cameras",
+            "50 52 21 11",
+            "50 52,5 21 11",
+            r"cameras.txt is damaged: line \d has '52,5' where a number should be",
+        ),
+        ("cameras", "PINHOLE", "OPENCV", r"cameras.txt is damaged: line \d ends where a number should follow"),
+        ("cameras", " 11\n", " 11 0.1\n", r"cameras.txt is damaged: line \d has '0.1' after its last number"),
+        ("cameras", "40 24", "40.5 24", "has '40.5' where a number should be"),
+        ("images", " 0 5 ", " 0 5m ", r"images.txt is damaged: line \d is not .* \('5m'\)"),
+        ("points3D", " 2 3 ", " 2 white ", r"points3D.txt is damaged: line \d has 'white' where"),
+    ],
+)
+def test_damaged_text_is_named_by_file_line_and_word(tmp_path, file, old, new, words):
+    folder = write_capture(tmp_path / "cup", suffix=".txt")
+    path = folder / f"sparse/0/{file}.txt"
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, 1))
+    assert_refused(words, load_scene, folder)
+
+
+def test_a_cloud_stands_for_points_that_are_not_there(tmp_path):
+    folder = write_capture(tmp_path / "cup", num_points=3)
+    rows = "".join(f"{view} 0 0 {view} 50 100\n" for view in range(4))
+    header = "".join(f"property float {axis}\n" for axis in ("x", "y", "z", "red", "green", "blue"))
+    cloud = folder / "sparse/0/points3D.ply"
+    cloud.write_text(f"ply\nformat ascii 1.0\nelement vertex 4\n{header}end_header\n{rows}")
+    assert len(load_scene(folder).points) == 3 and load_scene(folder).notes[-1].startswith("points3D.ply not used: ")
+    (folder / "sparse/0/points3D.bin").unlink()
+    scene = load_scene(folder)
+    assert scene.point_colors.tolist() == [[view, 50, 100] for view in range(4)] and not scene.drawn_points
+    assert scene.notes[0].endswith("9 images, 4 points of points3D.ply") and not len(scene.train.observations)
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
+def test_a_list_of_test_photos_is_the_split(tmp_path, place):
+    folder = write_capture(tmp_path / "cup")
+    (folder / place / "test.txt").write_text("photo03.png\r\n\nimages/photo05\nanother.png\n")
+    scene = load_scene(folder)
+    assert scene.test.names == ("photo03.png", "photo05.png") and len(scene.train) == 7
+    assert scene.notes[0].endswith("20 points, by test.txt 7 for training, 2 for testing")
+    (folder / place / "test.txt").write_text("another.png")
+    scene = load_scene(folder)
+    assert scene.test.names == ("photo00.png", "photo08.png") and "test.txt not used: 0 of its" in scene.notes[0]
+
+
+def test_poses_of_frames_that_images_contradict_are_said(tmp_path):
+    folder = write_capture(tmp_path / "cup", suffix=".txt")
+    images = folder / "sparse/0/images.txt"
+    moved = each_line(lambda words, line: " ".join([*words[:7], "9", *words[8:]]) if "photo" in line else line)
+    images.write_text(moved(images.read_text()))
+    scene = load_scene(folder)
+    assert scene.doubt in scene.notes and scene.doubt.startswith("poses are of frames.txt, and ")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from helpers.captures import TARGET, camera_to_world, write_transforms
 from helpers.refusals import assert_refused
 
@@ -60,8 +61,100 @@ def test_colors_of_points_are_scaled_by_their_type(kind, given, read):
         )
 
 
-def set_pose(value):
-    return lambda content: content["frames"][2].update(transform_matrix=value)
+def set_poses(value, *views: int):
+    return lambda content: [content["frames"][view].update(transform_matrix=value) for view in views or range(9)]
+
+
+def of_all_poses(function):
+    return lambda content: [f.update(transform_matrix=function(f["transform_matrix"])) for f in content["frames"]]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content.update(k1=None, p1=None, ply_file_path=None, train_filenames=None, is_fisheye=0),
+        lambda content: content.update(w="20", h="10", fl_x="25.0", k1="0"),
+        lambda content: content.update(camera_model="pinhole"),
+        of_all_poses(lambda pose: np.ravel(pose).tolist()),
+        of_all_poses(lambda pose: np.transpose(pose).tolist()),
+        of_all_poses(lambda pose: np.ravel(pose)[:12].tolist()),
+        of_all_poses(lambda pose: [[str(number) for number in row] for row in pose]),
+    ],
+)
+def test_json_of_other_writers(tmp_path, change):
+    """Null is what is absent; numbers may be text, and a matrix be in a row or of columns."""
+    folder = write_transforms(tmp_path / "cup")
+    right = load_scene(folder)
+    edit(folder, change)
+    if (text := (folder / "transforms.json").read_text()) and "pinhole" in text:
+        (folder / "transforms.json").write_text(text, encoding="utf-16")
+    scene = load_scene(folder)
+    assert torch.equal(scene.train.cameras.viewmats, right.train.cameras.viewmats)
+    assert torch.equal(scene.train.cameras.Ks, right.train.cameras.Ks) and scene.notes == right.notes
+
+
+@pytest.mark.parametrize("value", [[[-math.inf] * 4] * 4, [[math.nan] * 4] * 3, None, 7, np.zeros((4, 4)).tolist()])
+def test_damaged_poses_are_left_out_and_counted(tmp_path, value):
+    folder = write_transforms(tmp_path / "cup", test_filenames=["./images/f3.png", "./images/f5.png"])
+    edit(folder, set_poses(value, 3, 4))
+    scene = load_scene(folder)
+    assert scene.test.names == ("f5.png",) and scene.train.names == tuple(f"f{view}.png" for view in (0, 1, 2, 6, 7, 8))
+    assert scene.notes[1] == (
+        "2 of 9 images are left out as damaged: 'f3.png' has a pose that is not a finite rotation and translation"
+    )
+
+
+def write_cloud(
+    path: Path, names=("red", "green", "blue"), end: str = "<", kind: str = "u1", first: float = 1.0
+) -> None:
+    """5 points at (i, 0, 0), but for the first one's x, of colours (i, 50, 100)."""
+    rows = np.zeros(5, [(axis, f"{end}f4") for axis in "xyz"] + [(name, end + kind) for name in names])
+    rows["x"] = np.arange(5)
+    rows["x"][0] = first
+    for name, values in zip(names, (np.arange(5), 50, 100), strict=False):
+        rows[name] = values
+    types = "".join(
+        f"property {'float' if rows.dtype[name].itemsize == 4 else 'uchar'} {name}\n" for name in rows.dtype.names
+    )
+    kind = {"<": "little", ">": "big"}[end]
+    path.write_bytes(
+        f"ply\nformat binary_{kind}_endian 1.0\nelement vertex 5\n{types}end_header\n".encode() + rows.tobytes()
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "left", "said"),
+    [
+        ({"end": ">"}, 5, "): 9 photos"),
+        ({"names": ("diffuse_red", "diffuse_green", "diffuse_blue")}, 5, "): 9 photos"),
+        ({"names": ("R", "G", "B"), "first": math.nan}, 4, "1 of 5 points are left out, as they are not finite"),
+        ({"names": ()}, 5, "5 points of sparse_pc.ply, grey as it has no colours"),
+    ],
+)
+def test_clouds_of_other_programs(tmp_path, options, left, said):
+    folder = write_transforms(tmp_path / "cup", ply_file_path="sparse_pc.ply")
+    write_cloud(folder / "sparse_pc.ply", **options)
+    scene = load_scene(folder)
+    expected = [[128] * 3] * 5 if options.get("names") == () else [[view, 50, 100] for view in range(5)]
+    assert scene.point_colors.tolist() == expected[-left:] and any(said in note for note in scene.notes)
+
+
+@pytest.mark.parametrize("name", ["sparse_pc.ply", "init.ply", "points3d.PLY"])
+def test_clouds_that_are_not_named_are_said(tmp_path, name):
+    folder = write_transforms(tmp_path / "cup")
+    write_cloud(folder / name)
+    scene = load_scene(folder)
+    assert scene.drawn_points and f"{name} not used: name one as ply_file_path in transforms.json" in scene.notes[1]
+
+
+def test_frames_to_test_on(tmp_path):
+    """ScanNet++'s are not among the others."""
+    folder = write_transforms(tmp_path / "cup")
+    edit(folder, lambda content: content.update(test_frames=content["frames"][6:], frames=content["frames"][:6]))
+    (folder / "transforms_test.json").write_text("{}")
+    scene = load_scene(folder)
+    assert scene.test.names == ("f6.png", "f7.png", "f8.png") and len(scene.train) == 6
+    assert "with test_frames" in scene.notes[0] and "transforms_test.json not used" in scene.notes
 
 
 @pytest.mark.parametrize(
@@ -80,8 +173,9 @@ def set_pose(value):
             r"names 9 photos, of which 7 are missing in .* \(none0.png, .*\): at least 3",
         ),
         (lambda content: content.update(ply_file_path="../points.ply"), "'../points.ply', is not there: bring it back"),
-        (set_pose(None), "f2.png' is no matrix of 4x4 numbers"),
-        (set_pose(np.diag([1, 1, -1, 1]).tolist()), "f2.png' is not a rotation"),
+        (set_poses(None), "f0.png' is no matrix of 4x4 numbers"),
+        (set_poses(np.diag([1, 1, -1, 1]).tolist()), "f0.png' is not a rotation"),
+        (lambda content: content.update(test_frames=[{}]), "a frame without a file_path"),
     ],
 )
 def test_what_is_refused(tmp_path, change, words):

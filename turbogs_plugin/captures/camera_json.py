@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from turbogs_plugin.captures.capture import LARGEST_SIDE
+from turbogs_plugin.captures.capture import LARGEST_SIDE, text_of
 from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.captures.decoding import photo_size
 from turbogs_plugin.captures.undistort import Lens, lens_of_camera
@@ -22,27 +22,31 @@ BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RA
 FISHEYE = "OPENCV_FISHEYE"
 
 
-def read_frames(source: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """A transforms file, and its frames. Raises `InputError` unless it is JSON with a list of frames."""
-    try:
-        text = source.read_text(encoding="utf-8-sig")  # Windows' editors write a mark at its beginning
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {source} ({str(error)[:200]}): export or copy it again") from error
-    content = parse_json(text, str(source))
-    frames = content.get("frames") if isinstance(content, dict) else None
+def read_frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """A transforms file, and its frames under a key. Raises `InputError` unless it is JSON with a list of frames."""
+    content = parse_json(text_of(source), str(source))
+    frames = content.get(key) if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise InputError(f"{source} has no list of frames: export it again")
-    return content, frames
+        raise InputError(f"{source} has no list of {key}: export it again")
+    return given(content), [given(frame) for frame in frames]
+
+
+def given(values: dict[str, Any]) -> dict[str, Any]:
+    """The entries that are not null, which other writers have for what is absent."""
+    return {key: value for key, value in values.items() if value is not None}
 
 
 def number_of(values: dict, source: Path, key: str, default: float | None = None) -> float | None:
-    """A finite number, or the default where the key is absent."""
+    """A finite number, also one that is written as text, or the default where the key is absent."""
     if key not in values:
         return default
     value = values[key]
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e300:
-        raise InputError(f"{source}: {key} is {str(value)[:40]!r}: it must be a finite number")
-    return float(value)
+    try:
+        if isinstance(value, bool) or not abs(number := float(value)) < 1e300:
+            raise ValueError
+    except (ValueError, TypeError, OverflowError):
+        raise InputError(f"{source}: {key} is {str(value)[:40]!r}: it must be a finite number") from None
+    return number
 
 
 def read_camera(values: dict[str, Any], photo: Path, source: Path) -> tuple[np.ndarray, tuple[int, int], Lens | None]:
@@ -63,10 +67,11 @@ def read_camera(values: dict[str, Any], photo: Path, source: Path) -> tuple[np.n
             f"{owner} has neither fl_x nor a camera_angle_x in 0 .. pi: write one of them there (pixels, radians), or "
             "find the cameras anew by 'turbogs reconstruct' on a folder of the photos alone"
         )
-    model = values.get("camera_model", FISHEYE if values.get("is_fisheye") is True else "OPENCV")
+    fisheye = str(values.get("is_fisheye")).lower() in ("true", "1")
+    model = str(values.get("camera_model", FISHEYE if fisheye else "OPENCV")).upper()
     if model not in (*BROWN_MODELS, FISHEYE):
         raise InputError(
-            f"{owner} is a {str(model)[:40]!r}: known are {', '.join((*BROWN_MODELS, FISHEYE))}; convert the capture "
+            f"{owner} is a {model[:40]!r}: known are {', '.join((*BROWN_MODELS, FISHEYE))}; convert the capture "
             "with ns-process-data, or use its COLMAP reconstruction"
         )
     bends = {key: number(key, 0.0) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
@@ -107,7 +112,8 @@ def pinhole(values: dict, source: Path, size: tuple[float, float]) -> np.ndarray
 
 
 def opengl_viewmat(matrix: Any, owner: str) -> np.ndarray:
-    """[4, 4] float64 world to camera, of a camera-to-world matrix in OpenGL's axes.
+    """[4, 4] float64 world to camera, of a camera-to-world matrix in OpenGL's axes; its numbers may be in one row, and
+    the matrix be transposed, where its last column says so.
 
     Raises:
         InputError: it is no matrix of 4x4 finite numbers, or no rotation and translation; `owner` names it.
@@ -116,6 +122,10 @@ def opengl_viewmat(matrix: Any, owner: str) -> np.ndarray:
         pose = np.array(matrix, dtype=np.float64)
     except (ValueError, TypeError, OverflowError):
         pose = np.empty(0)
+    if pose.shape in ((12,), (16,)):
+        pose = pose.reshape(-1, 4)
+    if pose.shape == (4, 4) and (pose[:, 3] == (0, 0, 0, 1)).all():
+        pose = pose.T  # or the camera is in the origin, and has a last row like that, too
     if pose.shape not in ((3, 4), (4, 4)):
         raise InputError(f"{owner} is no matrix of 4x4 numbers: export it again")
     try:

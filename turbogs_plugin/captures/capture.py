@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -44,6 +45,7 @@ class Capture:
         mask_files: files of masks that the capture names, one a view or None; given as empty where it names none.
         observations: where photos show the points, in pixels of the full-size photos, undistorted where they have a
             lens; None: the capture does not say.
+        doubt: what may be wrong with the poses.
     """
 
     names: tuple[str, ...]
@@ -59,6 +61,7 @@ class Capture:
     alpha: Literal["opacity", "mask"] = "opacity"
     mask_files: tuple[Path | None, ...] = ()
     observations: Observations | None = None
+    doubt: str = ""
 
     def __post_init__(self) -> None:
         self.lenses = self.lenses or (None,) * len(self.names)
@@ -71,12 +74,13 @@ class Capture:
         return np.array([size if lens is None else lens.photo_size for lens, size in both])
 
     def checked(self, source: Path) -> Capture:
-        """This capture. Raises `InputError`, which names `source`, unless every number is finite and in range."""
+        """This capture without damaged views and points, which a note counts.
+
+        Raises:
+            InputError: no point is finite, or fewer than `FEWEST_PHOTOS` training views are whole.
+        """
         if not self.names:
             raise InputError(f"{source} has no images with a pose: reconstruct the capture again")
-        bad = ~np.isfinite(self.points).all(axis=1)
-        if bad.any():
-            raise InputError(f"{source}: {bad.sum()} of {len(bad)} 3D points are not finite: {AGAIN}")
         orthogonality = self.viewmats[:, :3, :3] @ self.viewmats[:, :3, :3].transpose(0, 2, 1) - np.eye(3)
         with np.errstate(invalid="ignore"):
             posed = np.isfinite(self.viewmats).all(axis=(1, 2)) & (np.abs(orthogonality).max(axis=(1, 2)) < 1e-3)
@@ -84,17 +88,59 @@ class Capture:
         focal = self.Ks[:, [0, 1], [0, 1]]
         lensed = np.isfinite(self.Ks).all(axis=(1, 2)) & (focal > 0).all(axis=1)
         sized = ((self.sizes >= 1) & (self.sizes <= LARGEST_SIDE)).all(axis=1)
+        whole, notes = posed & lensed & sized, []
+        left = whole if self.test is None else whole & ~self.test
         for ok, trouble in (
             (posed, "a pose that is not a finite rotation and translation"),
             (lensed, "intrinsics that are not finite with positive focal lengths"),
             (sized, f"a size outside 1 .. {LARGEST_SIDE} pixels"),
         ):
             if not ok.all():
-                raise InputError(
-                    f"{source}: image '{self.names[int(np.argmin(ok))]}' has {trouble} ({(~ok).sum()} such images): "
-                    + AGAIN
-                )
-        return self
+                damage = f"'{self.names[int(np.argmin(ok))]}' has {trouble}"
+                if left.sum() < min(FEWEST_PHOTOS, len(ok)):
+                    raise InputError(f"{source}: image {damage} ({(~ok).sum()} such images): {AGAIN}")
+                notes.append(f"{(~ok).sum()} of {len(ok)} images are left out as damaged: {damage}")
+        finite = np.isfinite(self.points).all(axis=1)
+        if not finite.all():
+            if not finite.any():
+                raise InputError(f"{source}: none of {len(finite)} 3D points is finite: {AGAIN}")
+            notes.append(f"{(~finite).sum()} of {len(finite)} points are left out, as they are not finite")
+        return self._with(np.flatnonzero(whole), np.flatnonzero(finite), tuple(notes)) if notes else self
+
+    def _with(self, views: np.ndarray, points: np.ndarray, notes: tuple[str, ...]) -> Capture:
+        """Some views and points, both ascending, and more notes."""
+        shown = self.observations
+        if shown is not None:
+            shown = shown.of_views(views, np.ones((len(views), 2)))
+            places = np.searchsorted(points, shown.point_ids).clip(max=len(points) - 1)
+            kept = points[places] == shown.point_ids
+            shown = Observations(shown.pixels[kept], shown.view_ids[kept], places[kept])
+        return replace(
+            self,
+            names=tuple(self.names[view] for view in views),
+            viewmats=self.viewmats[views],
+            Ks=self.Ks[views],
+            sizes=self.sizes[views],
+            points=self.points[points],
+            point_colors=None if self.point_colors is None else self.point_colors[points],
+            lenses=tuple(self.lenses[view] for view in views),
+            notes=(*self.notes, *notes),
+            test=None if self.test is None else self.test[views],
+            mask_files=tuple(self.mask_files[view] for view in views),
+            observations=shown,
+        )
+
+
+def text_of(path: Path) -> str:
+    """A text file in UTF-8, or in UTF-16 or -32 as Windows' programs write it, with or without a mark; bytes of no text
+    are as `surrogateescape` has them. Raises `InputError` where it cannot be read."""
+    try:
+        content = path.read_bytes()
+        text = content.decode(json.detect_encoding(content), "surrogateescape")
+        return text.replace("\r\n", "\n").replace("\r", "\n")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)[:200]
+        raise InputError(f"cannot read {path} ({reason}): copy or export it again") from error
 
 
 def named(names: Sequence[str], most: int = 3) -> str:

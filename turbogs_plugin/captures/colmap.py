@@ -12,9 +12,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from turbogs_plugin.captures.capture import LARGEST_SIDE, Capture, named, require_printable
+from turbogs_plugin.captures.capture import (
+    FEWEST_PHOTOS,
+    LARGEST_SIDE,
+    Capture,
+    named,
+    require_printable,
+    text_of,
+)
 from turbogs_plugin.captures.colmap_files import (
+    CLOUD,
     FILES,
+    FIRST_OF_CLOUD,
     NO_POINT,
     SUFFIXES,
     ColmapModel,
@@ -23,6 +32,7 @@ from turbogs_plugin.captures.colmap_files import (
     read_poses,
 )
 from turbogs_plugin.captures.photo_files import IMAGES, find_named
+from turbogs_plugin.captures.starting_points import clouds_beside
 from turbogs_plugin.captures.undistort import Lens, lens_of_camera
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.scene import Observations
@@ -32,6 +42,7 @@ if TYPE_CHECKING:
 
 MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap", "colmap_sparse", "colmap_text", ".")
 """Folders of a scene's reconstructions, in order of preference; or numbered folders in them."""
+TEST = "test.txt"
 
 
 def load_pycolmap() -> ModuleType:
@@ -89,14 +100,16 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     found = find_named(scene, [image.name for image in model.images], folder, (IMAGES, ""))
     images = [model.images[place] for place in found.places]
     lenses = {image.camera: _lens(model.cameras[image.camera], folder) for image in images}
-    poses = read_poses(folder, suffix, model)
+    poses, doubt = read_poses(folder, suffix, model)
     pairs = [(model.cameras[image.camera], lenses[image.camera]) for image in images]
     viewmats = np.array([poses[image.number] for image in images]).reshape(-1, 4, 4)
     Ks = np.array([camera.calibration_matrix() if lens is None else lens.K for camera, lens in pairs]).reshape(-1, 3, 3)
     sizes = np.array([(camera.width, camera.height) if lens is None else lens.size for camera, lens in pairs])
     sizes = sizes.reshape(-1, 2).astype(np.int64)
     where = "" if found.folder == scene / IMAGES else f", photos in {found.folder}"
-    kind = {".bin": "binary", ".txt": "text"}[suffix]
+    kind, cloud = {".bin": "binary", ".txt": "text"}[suffix], folder / CLOUD
+    cloud_used = bool(len(model.points)) and model.points["id"][0] >= FIRST_OF_CLOUD
+    test, split = _own_split(scene, folder, found.names)
     return Capture(
         names=found.names,
         photo_folder=found.folder,
@@ -107,13 +120,31 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
         point_colors=model.points["color"].copy(),
         lenses=tuple(lens for _, lens in pairs),
         notes=(
-            f"COLMAP reconstruction {folder} ({kind}): {len(images)} images, {len(model.points):,} points{where}",
+            f"COLMAP reconstruction {folder} ({kind}): {len(images)} images, {len(model.points):,} points"
+            f"{f' of {CLOUD}' if cloud_used else ''}{where}{split}",
             *_choice_note(folder),
             *found.notes,
+            *clouds_beside([folder, scene], cloud if cloud_used else None, f"{CLOUD} is, in a model without points3D"),
+            *([doubt] if doubt else []),
         ),
+        test=test,
         alpha="mask",
+        doubt=doubt,
         observations=_observations(model, images, lenses) if len(model.points) else None,
     ).checked(folder)
+
+
+def _own_split(scene: Path, folder: Path, names: Sequence[str]) -> tuple[np.ndarray | None, str]:
+    """[V] bool: the photos that a ``test.txt`` lists, a name a line with suffix or without (Inria's), and words; None
+    where there is none, or where it leaves too few for training."""
+    for file in (folder / TEST, folder.parent / TEST, scene / TEST):
+        if file.is_file():
+            listed = {line.strip().removeprefix(f"{IMAGES}/") for line in text_of(file).split("\n")}
+            test = np.array([not listed.isdisjoint({name, str(Path(name).with_suffix(""))}) for name in names])
+            if test.any() and (~test).sum() >= FEWEST_PHOTOS:
+                return test, f", by {file.name} {(~test).sum()} for training, {test.sum()} for testing"
+            return None, f", {file} not used: {test.sum()} of its names have a photo"
+    return None, ""
 
 
 def _choice_note(model: Path) -> list[str]:

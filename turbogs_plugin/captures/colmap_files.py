@@ -16,16 +16,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from turbogs_plugin.captures.capture import text_of
+from turbogs_plugin.captures.starting_points import GREY, read_cloud
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.ply import read_colors
 
 if TYPE_CHECKING:
     import pycolmap
 
 FILES, SUFFIXES = ("cameras", "images", "points3D"), (".bin", ".txt")
+CLOUD = "points3D.ply"
+"""A cloud that stands for the points where a model has none of COLMAP's (InstantSplat)."""
+FIRST_OF_CLOUD = np.uint64(2**63)
+"""First identifier of its points, which no feature names."""
 FEATURE = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
 """A place in an image, and the identifier of the point that it shows, or `NO_POINT`."""
 POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error", "<f8")])
-"""A point, without its track."""
+"""A point, without its track. Its error is not used."""
 NO_POINT = np.uint64(2**64 - 1)
 TRACK_ELEMENT_BYTES = 8
 BITS = {"B": 8, "I": 32, "Q": 64}
@@ -35,6 +42,9 @@ SENSORS = {"CAMERA": 0, "IMU": 1}
 SMALLEST_IMAGE, SMALLEST_CAMERA = 73, 24
 """Bytes of an image with a name of one letter and without features; of a camera without parameters."""
 LONGEST_NAME = 4096
+NUMBER = re.compile(r"[-+.\de]+|[-+]?(nan|inf)", re.IGNORECASE)
+IMAGE = re.compile(r"\s*" + r"(\S+)\s+" * 8 + r"(\S+)[ \t](.+)")
+"""The line of an image in text: the name is the rest of it, with its spaces."""
 
 
 @dataclass(frozen=True)
@@ -75,26 +85,26 @@ def read_model(folder: Path, suffix: str) -> ColmapModel:
         InputError: a file is damaged, or an image has a camera that is not there; the line names file and place.
     """
     cameras, images, points = (folder / f"{file}{suffix}" for file in FILES)
+    points = points if points.is_file() or not (folder / CLOUD).is_file() else folder / CLOUD
     if absent := [path.name for path in (cameras, images, points) if not path.is_file()]:
         raise InputError(
             f"{folder} has no {' and no '.join(absent)}: bring back what is missing, or take that folder away and find "
             "the cameras by 'turbogs reconstruct'"
         )
-    if suffix == ".bin":
-        model = ColmapModel(_read_cameras(cameras), list(_binary_images(images)), _binary_points(points))
-    else:
-        model = ColmapModel(_read_cameras(cameras), list(_text_images(images)), _text_points(points))
+    read_images, read_points = (_binary_images, _binary_points) if suffix == ".bin" else (_text_images, _text_points)
+    known = _cloud_points(points) if points.name == CLOUD else read_points(points)
+    model = ColmapModel(_read_cameras(cameras), list(read_images(images)), known)
     for image in model.images:
         if image.camera not in model.cameras:
             raise _damaged(
                 images, f"image {image.number} has camera {image.camera}, which {cameras.name} does not have"
             )
-        _require_pose(images, f"image {image.number}", image.pose)
     return ColmapModel(model.cameras, model.images, model.points[np.argsort(model.points["id"], kind="stable")])
 
 
-def read_poses(folder: Path, suffix: str, model: ColmapModel) -> dict[int, np.ndarray]:
-    """[4, 4] float64 world to camera of each image, by its identifier.
+def read_poses(folder: Path, suffix: str, model: ColmapModel) -> tuple[dict[int, np.ndarray], str]:
+    """[4, 4] float64 world to camera of each image, by its identifier; NaN where the numbers are no pose. And a line
+    where an image's own pose is another than its frame's.
 
     A pose is by the image's frame and its camera's place in the rig, where ``rigs`` and ``frames`` are both there and
     have the image (COLMAP 3.12 and later); else the image's own.
@@ -105,7 +115,8 @@ def read_poses(folder: Path, suffix: str, model: ColmapModel) -> dict[int, np.nd
     poses = {image.number: _viewmat(image.pose) for image in model.images}
     rigs, frames = folder / f"rigs{suffix}", folder / f"frames{suffix}"
     if not (rigs.is_file() and frames.is_file()):
-        return poses
+        return poses, ""
+    own = dict(poses)
     in_rig: dict[int, dict[tuple[int, int], np.ndarray]] = {}  # of each rig, its sensors' places but the first one's
     for record in _records(rigs, 8):
         rig, count = record.take("II")
@@ -113,29 +124,33 @@ def read_poses(folder: Path, suffix: str, model: ColmapModel) -> dict[int, np.nd
         for position in range(count):
             sensor = record.take("iI")
             if position and record.take("B")[0]:
-                places[sensor] = _require_pose(rigs, f"rig {rig}", np.array(record.take("7d")))
+                places[sensor] = np.array(record.take("7d"))
     for record in _records(frames, 68):
         frame, rig, *pose, count = record.take("II7dI")
         if rig not in in_rig:
             raise _damaged(frames, f"frame {frame} has rig {rig}, which {rigs.name} does not have")
-        from_world = _viewmat(_require_pose(frames, f"frame {frame}", np.array(pose)))
+        from_world = _viewmat(np.array(pose))
         for kind, sensor, image in (record.take("iIQ") for _ in range(count)):
             if image in poses and kind == SENSORS["CAMERA"]:
                 place = in_rig[rig].get((kind, sensor))
                 poses[image] = from_world if place is None else _viewmat(place) @ from_world
-    return poses
-
-
-def _require_pose(path: Path, owner: str, pose: np.ndarray) -> np.ndarray:
-    if not np.isfinite(pose).all() or not 1e-6 < np.abs(pose[:4]).max() < 1e6:
-        raise _damaged(path, f"{owner} has a pose that is not finite, or a zero rotation")
-    return pose
+    others = sum(
+        not np.allclose(own[image], pose, rtol=1e-4, atol=1e-3, equal_nan=True) for image, pose in poses.items()
+    )
+    return poses, (
+        f"poses are of {frames.name}, and {others} of images{suffix} are others: take {frames.name} away if a program "
+        f"moved the images alone"
+        if others
+        else ""
+    )
 
 
 def _viewmat(pose: np.ndarray) -> np.ndarray:
-    """[4, 4] float64 of a quaternion and a translation [7]."""
+    """[4, 4] float64 of a quaternion of any length and a translation [7]; NaN where they are none."""
     import pycolmap
 
+    if not np.isfinite(pose).all() or not 1e-6 < np.abs(pose[:4]).max() < 1e6:
+        return np.full((4, 4), np.nan)
     rotation = pycolmap.Rotation3d(np.roll(pose[:4], -1))
     rotation.normalize()
     viewmat = np.eye(4)
@@ -157,24 +172,33 @@ class _Words:
         """The next numbers, by a layout of the struct module, with ``w`` for a word. Names of sensors and camera models
         count as numbers."""
         codes = (code for count, code in re.findall(r"(\d*)(\D)", layout) for code in code * int(count or 1))
+        return tuple([self._number(code) for code in codes])
+
+    def end(self) -> None:
+        if left := next(self.words, None):
+            raise _damaged(self.path, f"line {self.line} has {left[:40]!r} after its last number")
+
+    def _number(self, code: str) -> float | str:
+        word = next(self.words, None)
+        if word is None:
+            raise _damaged(self.path, f"line {self.line} ends where a number should follow")
         try:
-            return tuple([_number(next(self.words), code) for code in codes])
-        except (ValueError, KeyError, StopIteration):
-            raise _damaged(self.path, f"line {self.line} lacks a number, or has another word in its place") from None
+            if code in "wd":
+                return word if code == "w" else float(word)
+            if code == "i" and word.isidentifier():
+                import pycolmap
 
-
-def _number(word: str, code: str) -> float | str:
-    """Raises `ValueError` or `KeyError` where the word is none of its code."""
-    if code in "wd":
-        return word if code == "w" else float(word)
-    if code == "i" and word.isidentifier():
-        import pycolmap
-
-        return SENSORS[word] if word in SENSORS else int(pycolmap.CameraModelId.__members__[word])
-    number = int(word)
-    if code in BITS and not 0 <= number < 1 << BITS[code]:
-        raise ValueError
-    return number
+                models = pycolmap.CameraModelId.__members__
+                return SENSORS[word] if word in SENSORS else int(models[word.upper()])
+            exact = word.removeprefix("-").isdecimal()
+            number = int(word if exact else float(word))
+            if not exact and (number != float(word) or abs(number) > 2**53):
+                raise ValueError
+            if code in BITS and not 0 <= number < 1 << BITS[code]:
+                raise ValueError
+            return number
+        except (ValueError, OverflowError, KeyError):
+            raise _damaged(self.path, f"line {self.line} has {word[:40]!r} where a number should be") from None
 
 
 class _Binary:
@@ -200,6 +224,9 @@ class _Binary:
         """The next numbers, by a layout of the struct module."""
         numbers = struct.Struct("<" + layout)
         return numbers.unpack_from(self.data, self.skip(numbers.size))
+
+    def end(self) -> None:
+        """The next record follows."""
 
     def count(self, smallest: int) -> int:
         """A uint64 count of records that take at least `smallest` bytes each."""
@@ -249,6 +276,7 @@ def _read_cameras(path: Path) -> dict[int, pycolmap.Camera]:
             raise _damaged(path, f"camera {number} is {width}x{height} pixels")
         camera = pycolmap.Camera.create_from_model_name(number, models[model], 1.0, width, height)
         camera.params = list(record.take(f"{len(camera.params)}d"))
+        record.end()
         cameras[number] = camera
     return cameras
 
@@ -276,51 +304,64 @@ def _binary_points(path: Path) -> np.ndarray:
     return records[starts].view(POINT)[:, 0]
 
 
-def _lines(path: Path) -> list[str]:
-    """A text file's lines; a name need not be UTF-8, but then cannot be printed."""
-    try:
-        return path.read_text(encoding="utf-8-sig", errors="surrogateescape").split("\n")
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-
-
-def _pairs_of_lines(path: Path) -> Iterator[tuple[int, str, str]]:
-    """The number of the line of each image in an ``images.txt``, that line, and its line of features, which may be
-    empty."""
-    lines = enumerate(_lines(path), start=1)
-    for number, line in lines:
-        if line.strip() and not line.startswith("#"):
-            yield number, line, next(lines, (0, ""))[1]
-
-
 def _text_records(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """The number and the words of each line that is neither empty nor a comment."""
-    for number, line in enumerate(_lines(path), start=1):
+    """The number and the words of each line that is neither empty nor a comment. A name need not be UTF-8."""
+    for number, line in enumerate(text_of(path).split("\n"), start=1):
         if (words := line.split()) and not words[0].startswith("#"):
             yield number, words
 
 
 def _text_images(path: Path) -> Iterator[ModelImage]:
-    for line, text, features in _pairs_of_lines(path):
-        words = text.lstrip().split(" ", 9)  # the name is the rest, with its spaces
-        number, *pose, camera, name = _Words(path, line, words).take("I7dIw")
-        yield ModelImage(number, camera, name, np.array(pose), _text_features(path, line + 1, features))
+    """A line an image, and one of its features, which may be empty or lack."""
+    lines = text_of(path).split("\n")
+    place = 0
+    while place < len(lines):
+        text, place = lines[place], place + 1
+        if not text.strip() or text.startswith("#"):
+            continue
+        words = IMAGE.fullmatch(text.rstrip())
+        numbers = words.groups() if words else text.split()
+        number, *pose, camera, name = _Words(path, place, list(numbers)).take("I7dIw")
+        features = _text_features(path, place + 1, lines[place].split() if place < len(lines) else [])
+        place += features is not None
+        yield ModelImage(number, camera, name, np.array(pose), np.zeros(0, FEATURE) if features is None else features)
 
 
-def _text_features(path: Path, line: int, text: str) -> np.ndarray:
-    words = text.split()
-    features = np.zeros(len(words) // 3, FEATURE)
+def _text_features(path: Path, line: int, words: list[str]) -> np.ndarray | None:
+    """[n] of `FEATURE`; None where the line is the next image's: it ends in a name, or has ten numbers."""
+    if len(words) == 10 or (len(words) > 10 and not NUMBER.fullmatch(words[-1])):
+        return None
     try:
         numbers = np.array(words, np.float64).reshape(-1, 3)
-        points = [int(word) for word in words[2::3]]
-        features["point"] = np.array([NO_POINT if point < 0 else point for point in points], np.uint64)
     except (ValueError, OverflowError):
-        raise _damaged(path, f"line {line} is not x, y and point of features, again and again") from None
-    features["pixel"] = numbers[:, :2]
+        bad = next((f" ({word[:40]!r})" for word in words if not NUMBER.fullmatch(word)), "")
+        raise _damaged(path, f"line {line} is not x, y and point of features, again and again{bad}") from None
+    features = np.zeros(len(numbers), FEATURE)
+    features["pixel"], points = numbers[:, :2], numbers[:, 2]
+    known = (points >= 0) & (points < 2**63)
+    features["point"] = np.where(known, np.where(known, points, 0).astype(np.uint64), NO_POINT)
     return features
 
 
+def _cloud_points(path: Path) -> np.ndarray:
+    """[M] of `POINT` of a .ply beside cameras and images."""
+    xyz, colors = read_cloud(path)
+    points = np.zeros(len(xyz), POINT)
+    points["id"] = np.arange(len(xyz), dtype=np.uint64) + FIRST_OF_CLOUD
+    points["xyz"], points["color"] = xyz, GREY if colors is None else colors
+    return points
+
+
 def _text_points(path: Path) -> np.ndarray:
-    records = (_Words(path, line, words).take("Q3d3Bd") for line, words in _text_records(path))
-    points = [(number, (x, y, z), (red, green, blue), error) for number, x, y, z, red, green, blue, error in records]
-    return np.array(points, POINT)
+    """[M] of `POINT`. Colours may have decimals, as shares of white, too, and errors may lack."""
+    records = [_Words(path, line, words).take("Q6d") for line, words in _text_records(path)]
+    points = np.zeros(len(records), POINT)
+    points["id"] = np.array([number for number, *_ in records], np.uint64)
+    values = np.array([numbers for _, *numbers in records]).reshape(-1, 6)
+    colors = {name: values[:, column] for column, name in enumerate(("red", "green", "blue"), start=3)}
+    if (values[:, 3:] == np.rint(values[:, 3:])).all():
+        points["color"] = values[:, 3:].clip(0, 255)
+    else:
+        points["color"] = read_colors(path, colors)
+    points["xyz"] = values[:, :3]
+    return points

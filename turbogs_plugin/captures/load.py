@@ -117,6 +117,7 @@ def load_scene(
         frame=frame,
         extent=1.0,
         drawn_points=capture.point_colors is None,
+        doubt=capture.doubt,
         notes=tuple(filter(None, (*capture.notes, *notes))),
     )
 

@@ -1,23 +1,67 @@
-"""Random points to start from, for captures that bring none, in colours from the photos."""
+"""Points to start from: of a cloud in a .ply, or random ones in colours from the photos."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene.geometry import camera_centers, evenly, mean_neighbor_distances
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
+from turbogs_plugin.scene.ply import read_colors, read_vertices
 from turbogs_plugin.types import Cameras
+from turbogs_plugin.types.gaussians import SH_C0
 
 NUM_RANDOM_POINTS = 50_000
+GREY = 128
+"""Colour of points without one."""
+MODEL_PROPERTIES = {"opacity", "f_dc_0", "scale_0", "rot_0", "packed_position"}
+"""Properties of a .ply of which a model has at least one, and a cloud of points none."""
 LOOKING = 0.9
 """Share of the views that must have one point in their images to be taken for views of one thing."""
 LEAST_SPACING = 1e-2
 """Cameras nearer to each other than this share of their extent are taken to be in one place."""
 COLOR_VIEWS = 32
 """Photos that give random points their colours, at most."""
+
+
+def read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """[M, 3] float64 and [M, 3] uint8 of a cloud in a .ply; None where it has no colours. A 3DGS model's colours are
+    its harmonics of degree 0."""
+    vertices = {name.lower().removeprefix("diffuse_"): column for name, column in read_vertices(path).items()}
+    if not {"x", "y", "z"} <= set(vertices):
+        raise InputError(f"{path} has no x, y, z: export it again, or take it out")
+    points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    for channel, share in (("red", "f_dc_0"), ("green", "f_dc_1"), ("blue", "f_dc_2")):
+        if channel[0] in vertices:
+            vertices.setdefault(channel, vertices[channel[0]])
+        elif share in vertices:
+            vertices.setdefault(channel, (0.5 + SH_C0 * vertices[share].astype(np.float64)).clip(0.0, 1.0))
+    return points, read_colors(path, vertices)
+
+
+def plain_cloud(file: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Finite points of a .ply, [M, 3] float64 and [M, 3] uint8, grey where it has no colours; None where it is a
+    model's, or no .ply."""
+    if Path(file).suffix.lower() != ".ply" or not MODEL_PROPERTIES.isdisjoint(read_vertices(file)):
+        return None
+    points, colors = read_cloud(Path(file))
+    colors = np.full(points.shape, GREY, np.uint8) if colors is None else colors
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.any():
+        raise InputError(f"{file} has no finite point: export it again")
+    return points[finite], colors[finite]
+
+
+def clouds_beside(folders: Sequence[Path], used: Path | None, remedy: str) -> list[str]:
+    """A line on clouds in some folders that are not used; none where there is none. `remedy`: how they would be."""
+    files = [file for folder in folders for file in sorted(folder.glob("*.[pP][lL][yY]")) if file != used]
+    return [f"{', '.join(file.name for file in files[:3])} not used: {remedy}"] if files else []
 
 
 def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, str]:

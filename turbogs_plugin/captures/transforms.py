@@ -13,16 +13,19 @@ from typing import Any
 import numpy as np
 
 from turbogs_plugin.captures.camera_json import opengl_viewmat, read_camera, read_frames
-from turbogs_plugin.captures.capture import Capture
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, named
 from turbogs_plugin.captures.photo_files import file_named, find_named
+from turbogs_plugin.captures.starting_points import GREY, clouds_beside, read_cloud
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.ply import read_colors, read_vertices
 
 FILE, TRAIN_FILE = "transforms.json", "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")
 """NeRF-synthetic's files of test photos: the first that is there, and has a photo, is used."""
 TRAIN, VALIDATION, TEST = LISTS = ("train_filenames", "val_filenames", "test_filenames")
 """Lists of file names in a ``transforms.json`` that are the capture's own split."""
+
+TEST_FRAMES = "test_frames"
+"""Frames to test on, which are not among the others (ScanNet++)."""
 
 Frame = dict[str, Any]
 """A frame of a file, with what stands there for all frames."""
@@ -44,11 +47,12 @@ def read_transforms(scene: Path) -> Capture:
         used = [frame for frame in frames if _written(frame) in train | test]
         words = f", {len(frames) - len(used)} others not used" if len(used) < len(frames) else ""
         frames = used
-    points, colors = np.empty((0, 3)), None
-    if "ply_file_path" in content:
-        points, colors = _read_points(_file(scene, content["ply_file_path"], "ply_file_path", source))
-        words += f", {len(points):,} points of {content['ply_file_path']}"
-    return _capture(scene, source, frames, test, f"nerfstudio, instant-ngp{words}", points, colors)
+    if content.get(TEST_FRAMES):
+        tested = _frames(source, TEST_FRAMES)[1]
+        frames, test = [*frames, *tested], {*(test or ()), *map(_written, tested)}
+        words += f", with {TEST_FRAMES}"
+    unused = [name for name in TEST_FILES if (scene / name).is_file() and not (scene / TRAIN_FILE).is_file()]
+    return _capture(scene, source, content, frames, test, f"nerfstudio, instant-ngp{words}", unused)
 
 
 def read_blender(scene: Path) -> Capture:
@@ -59,16 +63,16 @@ def read_blender(scene: Path) -> Capture:
         InputError: as `read_transforms`; one photo in both files.
     """
     source = scene / TRAIN_FILE
-    _, train = _frames(source)
+    content, train = _frames(source)
     test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
     tested = [] if test_file is None else _frames(test_file)[1]
     words = f"NeRF-synthetic{f', with {test_file.name}' if test_file else ''}"
-    return _capture(scene, source, [*train, *tested], {_written(frame) for frame in tested}, words)
+    return _capture(scene, source, content, [*train, *tested], {_written(frame) for frame in tested}, words)
 
 
-def _frames(source: Path) -> tuple[dict[str, Any], list[Frame]]:
+def _frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[Frame]]:
     """A file's content, and its frames. Intrinsics and distortion may stand in each frame or for all."""
-    content, frames = read_frames(source)
+    content, frames = read_frames(source, key)
     if not all(isinstance(frame.get("file_path"), str) for frame in frames):
         raise InputError(f"{source} has a frame without a file_path: export it again")
     return content, [{**content, **frame} for frame in frames]
@@ -82,34 +86,46 @@ def _written(frame: Frame) -> str:
 def _capture(
     scene: Path,
     source: Path,
+    content: dict[str, Any],
     frames: list[Frame],
     test: Collection[str] | None,
     words: str,
-    points: np.ndarray | None = None,
-    colors: np.ndarray | None = None,
+    unused: Collection[str] = (),
 ) -> Capture:
-    """The capture of some frames, in the order of their photos' names.
+    """The capture of some frames, in the order of their photos' names; damaged poses are left out (`Capture.checked`).
 
     Args:
+        content: of the file; its ``ply_file_path`` has the points.
         test: written names of the test photos; None, and where none of them exists: no own split.
         words: on the kind of capture.
-        points: [M, 3] float64.
-        colors: [M, 3] uint8.
+        unused: names of files that are not used.
     """
-    names = [_written(frame) for frame in frames]
+    names, cloud = [_written(frame) for frame in frames], content.get("ply_file_path")
     others = {text for frame in frames for key, text in frame.items() if key != "file_path" and isinstance(text, str)}
     found = find_named(scene, [frame["file_path"] for frame in frames], source, ("", "images"), others)
-    viewmats, Ks, sizes, lenses, masks = [], [], [], [], []
+    viewmats, damaged, Ks, sizes, lenses, masks = [], [], [], [], [], []
     for name, place in zip(found.names, found.places, strict=True):
         frame, owner = frames[place], f"frame '{names[place]}'"
-        viewmats.append(opengl_viewmat(frame.get("transform_matrix"), f"{source}: the transform_matrix of {owner}"))
+        try:
+            pose = opengl_viewmat(frame.get("transform_matrix"), f"{source}: the transform_matrix of {owner}")
+        except InputError as error:
+            pose = np.full((4, 4), np.nan)
+            damaged.append(error)
+        viewmats.append(pose)
         K, size, lens = read_camera(frame, found.folder / name, source)
         Ks.append(K)
         sizes.append(size)
         lenses.append(lens)
         mask = frame.get("mask_path")
         masks.append(None if mask is None else _file(scene, mask, f"mask_path of {owner}", source))
+    points, colors, file = np.empty((0, 3)), None, None
+    if cloud is not None:
+        points, colors = read_cloud(file := _file(scene, cloud, "ply_file_path", source))
+        words += f", {len(points):,} points of {cloud}{', grey as it has no colours' if colors is None else ''}"
+        colors = np.full(points.shape, GREY, np.uint8) if colors is None else colors
     tested = np.array([names[place] in (test or ()) for place in found.places])
+    if damaged and (np.isfinite(viewmats).all(axis=(1, 2)) & ~tested).sum() < FEWEST_PHOTOS:
+        raise damaged[0]
     split = f", by its own split {(~tested).sum()} for training, {tested.sum()} for testing" if tested.any() else ""
     return Capture(
         names=found.names,
@@ -117,10 +133,15 @@ def _capture(
         viewmats=np.array(viewmats),
         Ks=np.array(Ks),
         sizes=np.array(sizes),
-        points=np.empty((0, 3)) if points is None else points,
+        points=points,
         point_colors=colors,
         lenses=tuple(lenses),
-        notes=(f"{source} ({words}): {len(found.names)} photos{split}", *found.notes),
+        notes=(
+            f"{source} ({words}): {len(found.names)} photos{split}",
+            *found.notes,
+            *([f"{named(list(unused))} not used"] if unused else []),
+            *clouds_beside([scene], file, f"name one as ply_file_path in {source.name} to begin with its points"),
+        ),
         test=tested if tested.any() else None,
         mask_files=tuple(masks),
     ).checked(source)
@@ -140,9 +161,9 @@ def _own_split(content: dict[str, Any], frames: list[Frame], source: Path) -> tu
         return None
     everything = {_written(frame) for frame in frames}
     if all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists.values()):
-        named = {key: {PureWindowsPath(name).as_posix() for name in names} for key, names in lists.items()}
-        test, validation = named.get(TEST, set()), named.get(VALIDATION, set())
-        train = named.get(TRAIN, everything - test - validation)
+        listed = {key: {PureWindowsPath(name).as_posix() for name in names} for key, names in lists.items()}
+        test, validation = listed.get(TEST, set()), listed.get(VALIDATION, set())
+        train = listed.get(TRAIN, everything - test - validation)
         test = test or validation or everything - train
         if train and test and not train & test and train | test | validation <= everything:
             return train, test
@@ -158,13 +179,3 @@ def _file(scene: Path, name: Any, what: str, source: Path) -> Path:
     if path is None:
         raise InputError(f"{source}: its {what}, {str(name)[:200]!r}, is not there: bring it back, or take it out")
     return scene / path
-
-
-def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """[M, 3] float64 and [M, 3] uint8 of a cloud, grey where it has no colours."""
-    vertices = read_vertices(path)
-    if not {"x", "y", "z"} <= set(vertices):
-        raise InputError(f"{path} has no x, y, z: export it again, or take ply_file_path out")
-    points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    colors = read_colors(path, vertices)
-    return points, np.full(points.shape, 128, dtype=np.uint8) if colors is None else colors

@@ -40,8 +40,8 @@ class RunOptions:
         max_memory: limit of tensors on the GPU: 2GiB, 1500MB (budget.max_memory). Photos and error maps move to the
             host if need be, then the number of Gaussians is limited.
         time_budget: time of training to end after: 20s, 2m (budget.time). The schedule is fitted to it.
-        init: start of the model (train.init): points of the capture, random points, or a model trained anywhere: a
-            .ply, .spz, gsplat's .pt, a checkpoint, or a run's folder.
+        init: start of the model (train.init): points of the capture, random points, a .ply of points in the capture's
+            coordinates, or a model trained anywhere: a .ply, .spz, gsplat's .pt, a checkpoint, or a run's folder.
     """
 
     config: Annotated[str | None, arg(metavar="NAME_OR_FILE")] = None

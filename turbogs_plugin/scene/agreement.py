@@ -62,7 +62,7 @@ def _contradiction(scene: Scene) -> str:
     ):
         if likeness(scene, other)[1] >= LIKENESS:
             return f"{what}, and with other poses they do: {remedy}"
-    return f"{what}: poses, points and photos must be of one solve and in one frame"
+    return f"{what}: {scene.doubt or 'poses, points and photos must be of one solve and in one frame'}"
 
 
 def likeness(scene: Scene, poses: np.ndarray) -> tuple[int, float]:

@@ -98,6 +98,7 @@ class Scene:
         drawn_points: the points were drawn at random, as the capture has none.
         reprojection_error: how far points are from where training photos show them, a median in pixels, by
             `refine_cameras`: for the accuracy of the cameras; None: the capture does not say.
+        doubt: what may be wrong with the poses; empty where nothing speaks against them.
         notes: what the capture was taken for, and what was done with its photos: lines for the user.
     """
 
@@ -110,4 +111,5 @@ class Scene:
     extent: float
     drawn_points: bool = False
     reprojection_error: float | None = None
+    doubt: str = ""
     notes: tuple[str, ...] = ()

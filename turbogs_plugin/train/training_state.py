@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from turbogs_plugin.captures.starting_points import colors_in_photos, starting_points
+from turbogs_plugin.captures.starting_points import colors_in_photos, plain_cloud, starting_points
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine
 from turbogs_plugin.engine.exposures import Exposures
@@ -25,6 +26,7 @@ from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gau
 from turbogs_plugin.plan.memory import cap_of
 from turbogs_plugin.plan.photo_gains import compare_exposures
 from turbogs_plugin.scene import PosedImages, Scene
+from turbogs_plugin.scene.agreement import require_agreement
 from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.scene.offload import OffloadedErrorMaps, place_views
 from turbogs_plugin.train.look import Background, Look, interpolated_exposures
@@ -245,7 +247,8 @@ def first_exposures(scene: Scene, resuming: bool, device: torch.device) -> Expos
 
 
 def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
-    """The model that training starts from: a given one, or one of points; and a backdrop if one is wanted.
+    """The model that training starts from: a given one, or one of the capture's or another cloud's points; and a
+    backdrop if one is wanted.
 
     If there are more points than `density.max_gaussians` allows, as many as it allows are taken, evenly in their order.
 
@@ -256,7 +259,7 @@ def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
         On the CPU.
 
     Raises:
-        InputError: the given model cannot be read, or the cap has no room for it or for the backdrop.
+        InputError: the given model cannot be read, given points are not of this capture, or the cap has no room.
     """
     train, cap = config.train, cap_of(config)
     others = BACKDROP_COUNT if train.backdrop else 0
@@ -265,9 +268,17 @@ def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
             f"density.max_gaussians {cap} leaves no room beside the {others} of the backdrop: allow more, or leave the "
             "backdrop out by train.backdrop=false"
         )
-    if init in ("points", "random"):
+    cloud = None if init in ("points", "random") else plain_cloud(init)
+    if init in ("points", "random") or cloud is not None:
         points, colors = scene.points, scene.point_colors
-        if init == "random":
+        if cloud is not None:
+            points, colors = (
+                torch.from_numpy(scene.frame.normalise_points(cloud[0])).float(),
+                torch.from_numpy(cloud[1]),
+            )
+            if not config.scene.force:
+                require_agreement(replace(scene, points=points, point_colors=colors, drawn_points=False))
+        elif init == "random":
             cameras = scene.train.cameras
             viewmats, Ks = cameras.viewmats.cpu().double().numpy(), cameras.Ks.cpu().double().numpy()
             points = torch.from_numpy(starting_points(viewmats, Ks, cameras.sizes)[0]).float()
