@@ -112,7 +112,7 @@ def test_which_kind_is_taken_of_several(tmp_path):
     shutil.copy(folder / "transforms_val.json", folder / "transforms.json")
     scene = load_scene(folder)
     assert scene.train.names == ("r_1.png", "r_2.png")
-    passed_over = "transforms_train.json, poses_bounds.npy not used"
+    passed_over = "transforms_train.json, poses_bounds.npy, transforms_test.json not used"
     assert scene.notes[1] == passed_over
     demo = write_demo_capture(tmp_path / "demo", views=4, width=32, height=24)
     for part in ("sparse", "images"):

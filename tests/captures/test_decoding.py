@@ -38,6 +38,24 @@ def test_a_tiff_that_pillow_would_turn_is_refused(tmp_path, orientation):
         assert_refused("photo.tif is a TIFF with an orientation in its EXIF data: ", photo_sizes, paths)
 
 
+@pytest.mark.parametrize(
+    ("start", "said"),
+    [
+        (b"\0\0\0\x24ftypheic\0\0\0\0mif1heic", "it is HEIC; convert it to JPEG"),
+        (b"\x76\x2f\x31\x01", "it is OpenEXR; convert it to JPEG"),
+        (b"\0\0\0\x18ftypmp42", "it is a video; take photos out of it"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "it is a pointer of Git LFS; fetch it by 'git lfs pull'"),
+        (b"\n<!DOCTYPE html>", "it is a web page; download it again"),
+        (b"PK\x03\x04", "it is an archive; unpack it"),
+        (b"words", "it is no image of a known kind; copy it there again"),
+        (b"", "the file is empty; copy it there again"),
+    ],
+)
+def test_what_is_no_photo_is_named_by_its_content(tmp_path, start, said):
+    (tmp_path / "photo.jpg").write_bytes(start + (start and bytes(100)))
+    assert_refused(f"cannot read the photo .*photo.jpg: {said}", photo_sizes, [tmp_path / "photo.jpg"])
+
+
 def test_what_ends_it_ends_the_decoding(capture, monkeypatch):
     """Ctrl-C, for example: photos that were not begun are not decoded any more."""
     begun = []

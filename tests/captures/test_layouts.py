@@ -11,9 +11,11 @@ import numpy as np
 import pycolmap
 import pytest
 from helpers.painted import painted_photo, require_points_at_their_pixels
+from helpers.refusals import assert_refused
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
+from turbogs_plugin.captures.kinds import holds_photos_alone, other_poses
 from turbogs_plugin.scene import Scene
 
 POINTS = np.array([[0.3, 0.0, 0.1], [-0.2, 0.25, -0.3], [0.0, -0.4, 0.35]])
@@ -164,3 +166,40 @@ def test_one_camera_a_photo_upright_and_lying(tmp_path, kind):
     scene = load_scene(tmp_path / "room")
     require_painted(scene)
     assert scene.train.cameras.sizes.tolist() == [list(size) for size in sizes[1:8]]
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        (
+            ["opensfm/reconstruction.json"],
+            "opensfm/reconstruction.json is not read, .* of OpenSfM or ODM: ns-process-data",
+        ),
+        (["cameras.xml"], "cameras.xml is not read, .* of Metashape"),
+        (["corrected_cameras/1.json"], "1.json is not read, .* of Polycam"),
+        ([], "has 3 photos and nothing that says where they were taken from: find the cameras by 'turbogs reconstruct"),
+    ],
+)
+def test_cameras_of_other_programs_are_named(tmp_path, files, words):
+    write_photos(tmp_path / "images", [pinhole(60, 40, 50.0)], NAMES[:3])
+    for file in files:
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_text("{}")
+    assert_refused(words, load_scene, tmp_path)
+    assert holds_photos_alone(tmp_path) and other_poses(tmp_path) == other_poses(tmp_path / "images")
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        ("1.RAF", r"1 file is of a kind that is not read \(1.RAF\): convert to JPEG"),
+        ("1.insv", "it is of a 360 degree camera: export flat views"),
+        ("1.mp4", "it is a video: take photos out of it, as by  ffmpeg"),
+        ("1.r3d", "'ns-process-data record3d' makes a capture of it"),
+        ("a.tar", "unpack it"),
+        ("1.usdz", "1.usdz cannot be read as photos"),
+    ],
+)
+def test_files_that_no_capture_has_are_named(tmp_path, file, words):
+    (tmp_path / file).write_bytes(b"x")
+    assert_refused(f"nor photos; .*{words}", load_scene, tmp_path)

@@ -45,6 +45,10 @@ CONTRADICTIONS = {
     "other axes": (lambda s: posed(s, OTHER_AXES @ s.train.cameras.viewmats.double().numpy()), "columns 2 and 3"),
     "inverse poses": (inverted, "invert each pose"),
     "points of another scene": (lambda s: replace(s, point_colors=s.point_colors.flip(0)), "of one solve"),
+    "stale frames": (
+        lambda s: replace(s, point_colors=s.point_colors.flip(0), doubt="poses of frames"),
+        "poses of frames",
+    ),
     "points far away": (lambda s: replace(s, points=s.points + 100.0), "cameras see no points: .*one frame"),
     "intrinsics in shares": (shares, "in pixels"),
     "no alpha": (transparent, "alpha 0"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from gsplat import export_splats
 from helpers.framework_runs import tiny_config
 from helpers.models import random_gaussians
@@ -31,6 +32,7 @@ from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.saved_model import load_given, load_model
 from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.train.training_state import initial_gaussians
 from turbogs_plugin.types import Gaussians
 from turbogs_plugin.viewer.show import open_state
 
@@ -303,3 +305,22 @@ def test_what_is_no_model_is_one_line(turbogs, capture, tmp_path):
             assert code == 2 and printed == "" and error.count("\n") == 1, (what, call[0], error)
             assert words in error and str(file) in error, (what, error)
             assert not list(tmp_path.glob("out*"))
+
+
+@pytest.mark.parametrize(("shift", "refused"), [(0.0, False), (100.0, True)])
+def test_a_plain_cloud_is_a_start(capture, tmp_path, shift, refused):
+    """A Gaussian for each finite point, in the capture's coordinates; a cloud in another frame is refused."""
+    scene = load_scene(capture)
+    points = np.repeat(scene.frame.restore_points(scene.points.numpy()) + shift, 2, axis=0)
+    colors = np.repeat(scene.point_colors.numpy(), 2, axis=0)
+    trimesh.PointCloud(np.concatenate([points, [[np.nan] * 3]]), np.concatenate([colors, [[1, 2, 3]]])).export(
+        tmp_path / "lidar.ply"
+    )
+    config = tiny_config(capture, f"train.init={tmp_path / 'lidar.ply'}").without_plan()
+    if refused:
+        with pytest.raises(InputError, match="the cameras see no points"):
+            initial_gaussians(scene, config, config.train.init)
+        config.scene.force = True
+    model = initial_gaussians(scene, config, config.train.init)
+    torch.testing.assert_close(model.means, torch.from_numpy(scene.frame.normalise_points(points)).float())
+    assert len(model) == 2 * len(scene.points)

@@ -32,8 +32,8 @@ def read_frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list
 
 
 def given(values: dict[str, Any]) -> dict[str, Any]:
-    """The entries that are not null, which other writers have for what is absent."""
-    return {key: value for key, value in values.items() if value is not None}
+    """The entries but for null and empty texts, which other writers have for what is absent."""
+    return {key: value for key, value in values.items() if value is not None and value != ""}
 
 
 def number_of(values: dict, source: Path, key: str, default: float | None = None) -> float | None:

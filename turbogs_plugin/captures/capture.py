@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -113,22 +113,17 @@ class Capture:
         if shown is not None:
             shown = shown.of_views(views, np.ones((len(views), 2)))
             places = np.searchsorted(points, shown.point_ids).clip(max=len(points) - 1)
-            kept = points[places] == shown.point_ids
-            shown = Observations(shown.pixels[kept], shown.view_ids[kept], places[kept])
-        return replace(
-            self,
-            names=tuple(self.names[view] for view in views),
-            viewmats=self.viewmats[views],
-            Ks=self.Ks[views],
-            sizes=self.sizes[views],
-            points=self.points[points],
-            point_colors=None if self.point_colors is None else self.point_colors[points],
-            lenses=tuple(self.lenses[view] for view in views),
-            notes=(*self.notes, *notes),
-            test=None if self.test is None else self.test[views],
-            mask_files=tuple(self.mask_files[view] for view in views),
-            observations=shown,
-        )
+            there = points[places] == shown.point_ids
+            shown = Observations(shown.pixels[there], shown.view_ids[there], places[there])
+        per_view = ("names", "viewmats", "Ks", "sizes", "lenses", "test", "mask_files")
+        kept: dict[str, Any] = {name: _rows(getattr(self, name), views) for name in per_view}
+        kept |= {name: _rows(getattr(self, name), points) for name in ("points", "point_colors")}
+        return replace(self, notes=(*self.notes, *notes), observations=shown, **kept)
+
+
+def _rows(values: Any, rows: np.ndarray) -> Any:
+    """Some rows of an array or a tuple; None of None."""
+    return tuple(values[row] for row in rows) if isinstance(values, tuple) else None if values is None else values[rows]
 
 
 def text_of(path: Path) -> str:

@@ -12,14 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from turbogs_plugin.captures.capture import (
-    FEWEST_PHOTOS,
-    LARGEST_SIDE,
-    Capture,
-    named,
-    require_printable,
-    text_of,
-)
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, named, require_printable, text_of
 from turbogs_plugin.captures.colmap_files import (
     CLOUD,
     FILES,
@@ -107,8 +100,8 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     sizes = np.array([(camera.width, camera.height) if lens is None else lens.size for camera, lens in pairs])
     sizes = sizes.reshape(-1, 2).astype(np.int64)
     where = "" if found.folder == scene / IMAGES else f", photos in {found.folder}"
-    kind, cloud = {".bin": "binary", ".txt": "text"}[suffix], folder / CLOUD
-    cloud_used = bool(len(model.points)) and model.points["id"][0] >= FIRST_OF_CLOUD
+    kind = {".bin": "binary", ".txt": "text"}[suffix]
+    cloud = folder / CLOUD if len(model.points) and model.points["id"][0] >= FIRST_OF_CLOUD else None
     test, split = _own_split(scene, folder, found.names)
     return Capture(
         names=found.names,
@@ -121,10 +114,10 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
         lenses=tuple(lens for _, lens in pairs),
         notes=(
             f"COLMAP reconstruction {folder} ({kind}): {len(images)} images, {len(model.points):,} points"
-            f"{f' of {CLOUD}' if cloud_used else ''}{where}{split}",
+            f"{f' of {CLOUD}' if cloud else ''}{where}{split}",
             *_choice_note(folder),
             *found.notes,
-            *clouds_beside([folder, scene], cloud if cloud_used else None, f"{CLOUD} is, in a model without points3D"),
+            *clouds_beside([folder, scene], cloud, f"{CLOUD} is, in a model without points3D"),
             *([doubt] if doubt else []),
         ),
         test=test,

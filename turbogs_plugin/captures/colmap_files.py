@@ -358,10 +358,9 @@ def _text_points(path: Path) -> np.ndarray:
     points = np.zeros(len(records), POINT)
     points["id"] = np.array([number for number, *_ in records], np.uint64)
     values = np.array([numbers for _, *numbers in records]).reshape(-1, 6)
-    colors = {name: values[:, column] for column, name in enumerate(("red", "green", "blue"), start=3)}
-    if (values[:, 3:] == np.rint(values[:, 3:])).all():
-        points["color"] = values[:, 3:].clip(0, 255)
-    else:
-        points["color"] = read_colors(path, colors)
+    colors = values[:, 3:]
+    if np.isfinite(colors).all() and (colors == np.rint(colors)).all():
+        colors = colors.astype(np.int64)
+    points["color"] = read_colors(path, dict(zip(("red", "green", "blue"), colors.T, strict=True)))
     points["xyz"] = values[:, :3]
     return points

@@ -25,24 +25,21 @@ SMALLEST_SIDE = 4
 """The shorter side of a reduced photo has at least this many pixels; of fewer, nothing is left to see."""
 OPAQUE_SUFFIXES = (".jpg", ".jpeg")
 """Suffixes of formats without alpha, whose headers need not be read again."""
-KINDS = {
-    "convert it to JPEG": {
-        "HEIC": re.compile(rb".{4}ftyp(hei|hev|mif1|msf1)", re.DOTALL),
-        "AVIF": re.compile(rb".{4}ftypavi", re.DOTALL),
-        "OpenEXR": re.compile(rb"\x76\x2f\x31\x01"),
-        "JPEG XL": re.compile(rb"\xff\x0a|.{4}JXL ", re.DOTALL),
-        "a camera's raw data": re.compile(rb"FUJIFILM|II[*R]\0|II\x55\0|MM\0[*]|IIRO|.{4}ftypcrx|\0MRM", re.DOTALL),
-        "WebP": re.compile(rb"RIFF.{4}WEBP", re.DOTALL),
-        "GIF, Photoshop's or PostScript": re.compile(rb"GIF8|8BPS|%(!PS|PDF)"),
-        "an SVG": re.compile(rb"\s*<svg|\s*<[?]xml", re.IGNORECASE),
-    },
-    "take photos out of it": {"a video": re.compile(rb".{4}ftyp|\x1aE\xdf\xa3|RIFF.{4}AVI", re.DOTALL)},
-    "fetch it by 'git lfs pull'": {"a pointer of Git LFS": re.compile(rb"version https://git-lfs")},
-    "fetch it by 'git annex get'": {"a pointer of git-annex": re.compile(rb"/annex/|[.]git/annex")},
-    "download it again": {"a web page": re.compile(rb"\s*<(!doctype|html|head|[?]php)", re.IGNORECASE)},
-    "unpack it": {"an archive": re.compile(rb"PK\x03\x04|\x1f\x8b|7z\xbc\xaf|Rar!")},
-}
-"""What files under the names of photos may be that Pillow does not read, by their first bytes and what to do."""
+CONVERT = "convert it to JPEG"
+KINDS = (
+    (rb".{4}ftyp(hei|hev|mif1|msf1)", "HEIC", CONVERT),
+    (rb".{4}ftypavi", "AVIF", CONVERT),
+    (rb"\x76\x2f\x31\x01", "OpenEXR", CONVERT),
+    (rb"\xff\x0a|.{4}JXL ", "JPEG XL", CONVERT),
+    (rb"FUJIFILM|II[*RU]\0|MM\0[*]|IIRO|.{4}ftypcrx|\0MRM", "a camera's raw data", CONVERT),
+    (rb"RIFF.{4}WEBP|GIF8|8BPS|%(!PS|PDF)|\s*<(svg|[?]xml)", "WebP, GIF or another kind", CONVERT),
+    (rb".{4}ftyp|\x1aE\xdf\xa3|RIFF.{4}AVI", "a video", "take photos out of it"),
+    (rb"version https://git-lfs", "a pointer of Git LFS", "fetch it by 'git lfs pull'"),
+    (rb"(/|[.]git/)annex/", "a pointer of git-annex", "fetch it by 'git annex get'"),
+    (rb"\s*<(!doctype|html|head)", "a web page", "download it again"),
+    (rb"PK\x03\x04|\x1f\x8b|7z\xbc\xaf|Rar!", "an archive", "unpack it"),
+)
+"""What files under the names of photos may be that Pillow does not read: their first bytes, and what to do."""
 MOST_THREADS = 16
 """Photos that are decoded at a time; undistorted and reduced, each takes up to 24 bytes a pixel."""
 
@@ -195,6 +192,6 @@ def _what_it_is(path: Path, remedy: str) -> tuple[str, str]:
         start = file.read(64)
     if not start:
         return "the file is empty", remedy
-    known = ((kind, advice) for advice, kinds in KINDS.items() for kind, form in kinds.items() if form.match(start))
-    kind, advice = next(known, ("no image of a known kind", remedy))
+    known = (said for form, *said in KINDS if re.match(form, start, re.DOTALL | re.IGNORECASE))
+    kind, advice = next(known, ["no image of a known kind", remedy])
     return f"it is {kind}", advice

@@ -28,9 +28,12 @@ OTHER_POSES = {
     "openMVG or Meshroom: openMVG_main_openMVG2Colmap, or export as COLMAP": ("sfm_data*", "*.sfm"),
     "Polycam: ns-process-data polycam": ("*cameras/*.json", "keyframes/*cameras", "mesh_info.json"),
     "Record3D: ns-process-data record3d": ("metadata.json", "EXR_RGBD"),
+    "a tracker: write its poses into a transforms.json": ("pose*.txt", "*traj*.txt", "groundtruth.txt", "*.pose.txt"),
     "the capture of a model: use that capture": ("cameras.json",),
 }
 """Files that may have cameras and are not read, by what writes them and the way from there to a capture."""
+SPLITS = ("test.txt", "train.txt", "val.txt", "split.json", "train_test_lists.json", "transforms_test.json")
+"""Files of splits, of which readers of other kinds of captures take none."""
 PARTS_OF_RUN = ("model.ply", "checkpoints", "report")
 """One of these lies beside the config.yaml of a run that has begun."""
 
@@ -53,7 +56,8 @@ def read_capture(scene: Path) -> Capture:
         except InputError as error:
             failed.append(error)
             continue
-        unused = ", ".join(name for name, _ in kinds[place + 1 :])
+        splits = (name for name in SPLITS if (scene / name).is_file() and name not in capture.notes[0])
+        unused = ", ".join([*(name for name, _ in kinds[place + 1 :]), *splits])
         notes = [*([f"{unused} not used"] if unused else []), *(f"not used: {error}" for error in failed)]
         return replace(capture, notes=(*capture.notes, *notes))
     raise failed[0] if failed else _no_capture(scene)
@@ -87,8 +91,9 @@ def _elsewhere(folder: Path) -> str:
 def other_poses(folder: Path) -> str:
     """A line on a file of another program's cameras in a folder, or in the one that its ``images`` are of; or empty."""
     places = (folder, folder.absolute().parent) if folder.absolute().name == IMAGES else (folder,)
-    patterns = ((place, source, form) for place in places for source, forms in OTHER_POSES.items() for form in forms)
-    files = ((file, source) for place, source, form in patterns for file in sorted(place.glob(form)))
+    patterns = [(source, form) for source, forms in OTHER_POSES.items() for form in forms]
+    globs = ((place.glob(at + form), source) for place in places for at in ("", "*/") for source, form in patterns)
+    files = ((file, source) for found, source in globs for file in found)
     return next((f"{file} is not read, which may have cameras of {source}" for file, source in files), "")
 
 

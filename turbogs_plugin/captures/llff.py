@@ -13,7 +13,7 @@ import numpy as np
 
 from turbogs_plugin.captures.capture import Capture, require_printable
 from turbogs_plugin.captures.photo_files import IMAGES, NAMED_SUFFIXES, REDUCED, maps_beside, unread
-from turbogs_plugin.captures.starting_points import NUM_RANDOM_POINTS, points_in_views
+from turbogs_plugin.captures.starting_points import NUM_RANDOM_POINTS, clouds_beside, points_in_views
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import viewmat_of_pose
 
@@ -64,6 +64,7 @@ def read_llff(scene: Path) -> Capture:
         notes=(
             f"{source} (LLFF): {len(names)} photos of {folder.name}, no points, so {len(points):,} random ones within "
             f"the views at depths of {depths}",
+            *clouds_beside([scene], None, "LLFF's captures begin with random points"),
         ),
         alpha="mask",
     ).checked(source)

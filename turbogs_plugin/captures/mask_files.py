@@ -22,15 +22,7 @@ from turbogs_plugin.masks import PixelMasks
 
 FOLDER = "masks"
 CONVENTIONS = "NAME.png, NAME.EXTENSION.png or NAME.jpg"
-FORMS = (
-    "{stem}.png",
-    "{name}.png",
-    f"{{name}}{MASK_OF_NAME}",
-    "{stem}_mask.png",
-    "{name}",
-    "{stem}.jpg",
-    "{stem}.jpeg",
-)
+FORMS = ["{stem}.png", "{name}.png", "{name}.mask.png", "{stem}_mask.png", "{name}", "{stem}.jpg", "{stem}.jpeg"]
 """Names of masks in their folder, in any letters, the first that is there before others."""
 HALF = 128
 """Value from which a pixel of a JPEG counts, whose compression leaves no exact zeros."""

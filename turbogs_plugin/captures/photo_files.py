@@ -90,17 +90,12 @@ def unread(path: Path, every: bool = False) -> str:
     maps = maps_beside(file for file in files if file.suffix.lower() in PHOTO_SUFFIXES)
     if maps := [file for file in maps if not file.name.endswith(MASK_OF_NAME)]:
         said.append(f"{len(maps)} files are masks or maps of photos by their names, no photos ({maps[0].name})")
-    said += [f"{folder.name}/ holds no photos by its name" for folder in _folders_of_maps(path)]
+    named_so = (entry for entry in sorted(entries[1:]) if NO_PHOTOS.fullmatch(entry.name))
+    others = [entry for entry in named_so if not READ_SO.fullmatch(entry.name) and find_photos(entry)[1]]
+    said += [f"{folder.name}/ holds no photos by its name" for folder in others]
     if every and files and not said:
         said.append(f"{named([file.name for file in files])} cannot be read as photos")
     return "; ".join(said)
-
-
-def _folders_of_maps(folder: Path) -> list[Path]:
-    """Folders of images in a folder that hold none by their names, but for masks that are read and reduced copies."""
-    entries = sorted(folder.iterdir()) if folder.is_dir() else []
-    others = (entry for entry in entries if NO_PHOTOS.fullmatch(entry.name) and not READ_SO.fullmatch(entry.name))
-    return [entry for entry in others if any(file.suffix.lower() in NAMED_SUFFIXES for file in _files(entry, 0))]
 
 
 def broken_link(path: Path) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from turbogs_plugin.captures.camera_json import opengl_viewmat, read_camera, read_frames
-from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, named
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture
 from turbogs_plugin.captures.photo_files import file_named, find_named
 from turbogs_plugin.captures.starting_points import GREY, clouds_beside, read_cloud
 from turbogs_plugin.errors import InputError
@@ -51,8 +51,7 @@ def read_transforms(scene: Path) -> Capture:
         tested = _frames(source, TEST_FRAMES)[1]
         frames, test = [*frames, *tested], {*(test or ()), *map(_written, tested)}
         words += f", with {TEST_FRAMES}"
-    unused = [name for name in TEST_FILES if (scene / name).is_file() and not (scene / TRAIN_FILE).is_file()]
-    return _capture(scene, source, content, frames, test, f"nerfstudio, instant-ngp{words}", unused)
+    return _capture(scene, source, content, frames, test, f"nerfstudio, instant-ngp{words}")
 
 
 def read_blender(scene: Path) -> Capture:
@@ -90,7 +89,6 @@ def _capture(
     frames: list[Frame],
     test: Collection[str] | None,
     words: str,
-    unused: Collection[str] = (),
 ) -> Capture:
     """The capture of some frames, in the order of their photos' names; damaged poses are left out (`Capture.checked`).
 
@@ -98,12 +96,11 @@ def _capture(
         content: of the file; its ``ply_file_path`` has the points.
         test: written names of the test photos; None, and where none of them exists: no own split.
         words: on the kind of capture.
-        unused: names of files that are not used.
     """
     names, cloud = [_written(frame) for frame in frames], content.get("ply_file_path")
     others = {text for frame in frames for key, text in frame.items() if key != "file_path" and isinstance(text, str)}
     found = find_named(scene, [frame["file_path"] for frame in frames], source, ("", "images"), others)
-    viewmats, damaged, Ks, sizes, lenses, masks = [], [], [], [], [], []
+    rows, damaged = [], []
     for name, place in zip(found.names, found.places, strict=True):
         frame, owner = frames[place], f"frame '{names[place]}'"
         try:
@@ -111,13 +108,9 @@ def _capture(
         except InputError as error:
             pose = np.full((4, 4), np.nan)
             damaged.append(error)
-        viewmats.append(pose)
-        K, size, lens = read_camera(frame, found.folder / name, source)
-        Ks.append(K)
-        sizes.append(size)
-        lenses.append(lens)
-        mask = frame.get("mask_path")
-        masks.append(None if mask is None else _file(scene, mask, f"mask_path of {owner}", source))
+        mask = None if "mask_path" not in frame else _file(scene, frame["mask_path"], f"mask_path of {owner}", source)
+        rows.append((pose, *read_camera(frame, found.folder / name, source), mask))
+    viewmats, Ks, sizes, lenses, masks = zip(*rows, strict=True)
     points, colors, file = np.empty((0, 3)), None, None
     if cloud is not None:
         points, colors = read_cloud(file := _file(scene, cloud, "ply_file_path", source))
@@ -135,15 +128,14 @@ def _capture(
         sizes=np.array(sizes),
         points=points,
         point_colors=colors,
-        lenses=tuple(lenses),
+        lenses=lenses,
         notes=(
             f"{source} ({words}): {len(found.names)} photos{split}",
             *found.notes,
-            *([f"{named(list(unused))} not used"] if unused else []),
             *clouds_beside([scene], file, f"name one as ply_file_path in {source.name} to begin with its points"),
         ),
         test=tested if tested.any() else None,
-        mask_files=tuple(masks),
+        mask_files=masks,
     ).checked(source)
 
 
