@@ -93,8 +93,9 @@ def unread(path: Path, every: bool = False) -> str:
     named_so = (entry for entry in sorted(entries[1:]) if NO_PHOTOS.fullmatch(entry.name))
     others = [entry for entry in named_so if not READ_SO.fullmatch(entry.name) and find_photos(entry)[1]]
     said += [f"{folder.name}/ holds no photos by its name" for folder in others]
-    if every and files and not said:
-        said.append(f"{named([file.name for file in files])} cannot be read as photos")
+    strange = [file.name for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
+    if every and strange and not said:
+        said.append(f"{named(strange)} cannot be read as photos")
     return "; ".join(said)
 
 
