@@ -65,6 +65,8 @@ def test_mutated_models(capture, tmp_path, file, suffix):
     ("file", "place", "replacement", "words"),
     [
         ("images", 8 + 60, struct.pack("<I", 7), "has camera 7, which"),
+        ("images", 8, struct.pack("<I", 2), "images.bin is damaged: two images have the number 2"),
+        ("images", 0, b"version https://git-lfs.github.com/spec/v1", "images.bin is a pointer of Git LFS: fetch it by"),
         ("cameras", 8 + 4, struct.pack("<i", 99), "unknown model 99"),
         ("cameras", 8 + 8, struct.pack("<Q", 10**6), "a size outside 1 .. 65535 .*: export or reconstruct it"),
         ("cameras", 8 + 24, struct.pack("<d", -5.0), "positive focal lengths|not a COLMAP"),

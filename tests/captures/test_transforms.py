@@ -72,7 +72,7 @@ def of_all_poses(function):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda content: content.update(k1=None, p1=None, ply_file_path=None, train_filenames=None, is_fisheye=0),
+        lambda content: content.update(k1=None, p1=None, ply_file_path=None, train_filenames=None, val_filenames=[]),
         lambda content: content.update(w="20", h="10", fl_x="25.0", k1="0"),
         lambda content: content.update(camera_model="pinhole"),
         of_all_poses(lambda pose: np.ravel(pose).tolist()),

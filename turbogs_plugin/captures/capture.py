@@ -126,16 +126,26 @@ def _rows(values: Any, rows: np.ndarray) -> Any:
     return tuple(values[row] for row in rows) if isinstance(values, tuple) else None if values is None else values[rows]
 
 
+def bytes_of(path: Path) -> bytes:
+    """A file's content. Raises `InputError` where it cannot be read, or Git LFS has left a pointer in its place."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+    if content.startswith(b"version https://git-lfs"):
+        raise InputError(f"{path} is a pointer of Git LFS: fetch it by 'git lfs pull'")
+    return content
+
+
 def text_of(path: Path) -> str:
     """A text file in UTF-8, or in UTF-16 or -32 as Windows' programs write it, with or without a mark; bytes of no text
     are as `surrogateescape` has them. Raises `InputError` where it cannot be read."""
+    content = bytes_of(path)
     try:
-        content = path.read_bytes()
         text = content.decode(json.detect_encoding(content), "surrogateescape")
-        return text.replace("\r\n", "\n").replace("\r", "\n")
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)[:200]
-        raise InputError(f"cannot read {path} ({reason}): copy or export it again") from error
+    except ValueError as error:
+        raise InputError(f"cannot read {path} ({str(error)[:200]}): copy or export it again") from error
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def named(names: Sequence[str], most: int = 3) -> str:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from turbogs_plugin.captures.capture import text_of
+from turbogs_plugin.captures.capture import bytes_of, text_of
 from turbogs_plugin.captures.starting_points import GREY, read_cloud
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.ply import read_colors
@@ -94,11 +94,14 @@ def read_model(folder: Path, suffix: str) -> ColmapModel:
     read_images, read_points = (_binary_images, _binary_points) if suffix == ".bin" else (_text_images, _text_points)
     known = _cloud_points(points) if points.name == CLOUD else read_points(points)
     model = ColmapModel(_read_cameras(cameras), list(read_images(images)), known)
+    numbers: set[int] = set()
     for image in model.images:
         if image.camera not in model.cameras:
-            raise _damaged(
-                images, f"image {image.number} has camera {image.camera}, which {cameras.name} does not have"
-            )
+            trouble = f"image {image.number} has camera {image.camera}, which {cameras.name} does not have"
+            raise _damaged(images, trouble)
+        if image.number in numbers:
+            raise _damaged(images, f"two images have the number {image.number}")
+        numbers.add(image.number)
     return ColmapModel(model.cameras, model.images, model.points[np.argsort(model.points["id"], kind="stable")])
 
 
@@ -115,7 +118,8 @@ def read_poses(folder: Path, suffix: str, model: ColmapModel) -> tuple[dict[int,
     poses = {image.number: _viewmat(image.pose) for image in model.images}
     rigs, frames = folder / f"rigs{suffix}", folder / f"frames{suffix}"
     if not (rigs.is_file() and frames.is_file()):
-        return poses, ""
+        alone = next((file.name for file in (rigs, frames) if file.is_file()), "")
+        return poses, f"{alone} is not used: of rigs{suffix} and frames{suffix} one is missing" if alone else ""
     own = dict(poses)
     in_rig: dict[int, dict[tuple[int, int], np.ndarray]] = {}  # of each rig, its sensors' places but the first one's
     for record in _records(rigs, 8):
@@ -205,12 +209,7 @@ class _Binary:
     """A file's bytes, read from front to end; asking for more than there are raises `InputError`."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        try:
-            self.data = path.read_bytes()
-        except OSError as error:
-            raise InputError(f"cannot read {path}: {error.strerror}") from error
-        self.position = 0
+        self.path, self.data, self.position = path, bytes_of(path), 0
 
     def skip(self, size: int) -> int:
         """Step over `size` bytes and return where they began."""

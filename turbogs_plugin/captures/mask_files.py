@@ -15,7 +15,15 @@ from PIL import Image
 
 from turbogs_plugin.captures.capture import Capture
 from turbogs_plugin.captures.decoding import OPAQUE_SUFFIXES, decoding_threads, is_transparent, opened_image
-from turbogs_plugin.captures.photo_files import MASK_OF_NAME, MASKS, files_below, find_photos, maps_beside, plain
+from turbogs_plugin.captures.photo_files import (
+    MASK_OF_NAME,
+    MASKS,
+    broken_link,
+    files_below,
+    find_photos,
+    maps_beside,
+    plain,
+)
 from turbogs_plugin.captures.undistort import Lens
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks
@@ -45,7 +53,8 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
     found = [file or finder(name) for file, name in zip(capture.mask_files, capture.names, strict=True)]
     if not (files := [file for file in found if file is not None]):
         unused = (f"{folder} is not used: it has no {CONVENTIONS} of a photo" for folder in folders)
-        return found, next(unused, "") or misnamed(parents) or _beside(photos)
+        links = (broken_link(parent / FOLDER) for parent in parents)
+        return found, next(unused, "") or next(filter(None, links), "") or misnamed(parents) or _beside(photos)
     whole = f"; {len(found) - len(files)} photos without one are whole" if len(files) < len(found) else ""
     return found, f"masks of {len(files)} of {len(found)} photos, as {files[0]}{whole}"
 

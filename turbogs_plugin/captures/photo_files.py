@@ -34,7 +34,8 @@ MASKS = "(.*[_. -])?(mask|matte|segmentation)s?(_images)?"
 """Names of folders of masks, in any letters; one of them is read (`mask_files.FOLDER`)."""
 MASK_OF_NAME = ".mask.png"
 """RealityScan's masks are ``NAME.EXTENSION.mask.png``, beside the photos, too."""
-_MAPS = "(?:mask|matte|depth|disparity|normal|semantic|segmentation|confidence)s?(?:[_-]?(?:map|image|vi[sz])s?)?"
+_MAPS = "(?:mask|matte|depth|disparity|normal|albedo|semantic|seg|segmentation|instance|label|conf|confidence)s?"
+_MAPS += "(?:[_-]?(?:map|image|vi[sz])s?)?"
 NO_PHOTOS = re.compile(rf"\..*|images_\d+|(?:.*[_. -])?{_MAPS}(?:_\d+)?", re.IGNORECASE)
 """Folders without photos: hidden ones, copies reduced by a factor (``images_4``), masks, maps of depth and others."""
 READ_SO = re.compile(r"\..*|(images|masks)_\d+|masks")

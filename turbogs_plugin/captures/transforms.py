@@ -148,7 +148,7 @@ def _own_split(content: dict[str, Any], frames: list[Frame], source: Path) -> tu
     Raises:
         InputError: lists that are no split.
     """
-    lists = {key: content[key] for key in LISTS if key in content}
+    lists = {key: content[key] for key in LISTS if content.get(key)}
     if not lists:
         return None
     everything = {_written(frame) for frame in frames}
