@@ -42,6 +42,7 @@ SENSORS = {"CAMERA": 0, "IMU": 1}
 SMALLEST_IMAGE, SMALLEST_CAMERA = 73, 24
 """Bytes of an image with a name of one letter and without features; of a camera without parameters."""
 LONGEST_NAME = 4096
+NO_FEATURES = np.zeros(0, FEATURE)
 NUMBER = re.compile(r"[-+.\de]+|[-+]?(nan|inf)", re.IGNORECASE)
 IMAGE = re.compile(r"\s*" + r"(\S+)\s+" * 8 + r"(\S+)[ \t](.+)")
 """The line of an image in text: the name is the rest of it, with its spaces."""
@@ -194,11 +195,8 @@ class _Words:
 
                 models = pycolmap.CameraModelId.__members__
                 return SENSORS[word] if word in SENSORS else int(models[word.upper()])
-            exact = word.removeprefix("-").isdecimal()
-            number = int(word if exact else float(word))
-            if not exact and (number != float(word) or abs(number) > 2**53):
-                raise ValueError
-            if code in BITS and not 0 <= number < 1 << BITS[code]:
+            number = int(float(word))
+            if number != float(word) or (code in BITS and not 0 <= number < 1 << BITS[code]):
                 raise ValueError
             return number
         except (ValueError, OverflowError, KeyError):
@@ -312,18 +310,17 @@ def _text_records(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _text_images(path: Path) -> Iterator[ModelImage]:
     """A line an image, and one of its features, which may be empty or lack."""
-    lines = text_of(path).split("\n")
-    place = 0
-    while place < len(lines):
-        text, place = lines[place], place + 1
-        if not text.strip() or text.startswith("#"):
-            continue
-        words = IMAGE.fullmatch(text.rstrip())
-        numbers = words.groups() if words else text.split()
-        number, *pose, camera, name = _Words(path, place, list(numbers)).take("I7dIw")
-        features = _text_features(path, place + 1, lines[place].split() if place < len(lines) else [])
-        place += features is not None
-        yield ModelImage(number, camera, name, np.array(pose), np.zeros(0, FEATURE) if features is None else features)
+    lines = list(enumerate([*text_of(path).split("\n"), ""], start=1))[::-1]  # taken from the end
+    while lines:
+        line, text = lines.pop()
+        if text.strip() and not text.startswith("#"):
+            words = IMAGE.fullmatch(text.rstrip())
+            numbers = list(words.groups()) if words else text.split()
+            number, *pose, camera, name = _Words(path, line, numbers).take("I7dIw")
+            features = _text_features(path, line + 1, lines[-1][1].split())
+            if features is not None:
+                lines.pop()
+            yield ModelImage(number, camera, name, np.array(pose), features if features is not None else NO_FEATURES)
 
 
 def _text_features(path: Path, line: int, words: list[str]) -> np.ndarray | None:

@@ -28,11 +28,9 @@ OPAQUE_SUFFIXES = (".jpg", ".jpeg")
 CONVERT = "convert it to JPEG"
 KINDS = (
     (rb".{4}ftyp(hei|hev|mif1|msf1)", "HEIC", CONVERT),
-    (rb".{4}ftypavi", "AVIF", CONVERT),
     (rb"\x76\x2f\x31\x01", "OpenEXR", CONVERT),
-    (rb"\xff\x0a|.{4}JXL ", "JPEG XL", CONVERT),
     (rb"FUJIFILM|II[*RU]\0|MM\0[*]|IIRO|.{4}ftypcrx|\0MRM", "a camera's raw data", CONVERT),
-    (rb"RIFF.{4}WEBP|GIF8|8BPS|%(!PS|PDF)|\s*<(svg|[?]xml)", "WebP, GIF or another kind", CONVERT),
+    (rb"RIFF.{4}WEBP|.{4}ftypavi|\xff\x0a|.{4}JXL |GIF8|8BPS|%(!PS|PDF)|\s*<(svg|[?]xml)", "of another kind", CONVERT),
     (rb".{4}ftyp|\x1aE\xdf\xa3|RIFF.{4}AVI", "a video", "take photos out of it"),
     (rb"version https://git-lfs", "a pointer of Git LFS", "fetch it by 'git lfs pull'"),
     (rb"(/|[.]git/)annex/", "a pointer of git-annex", "fetch it by 'git annex get'"),

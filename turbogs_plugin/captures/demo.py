@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,6 +45,9 @@ PHOTO_NAME = "view_{:03d}.png"
 class Solid:
     """A solid on the vertical axis of its own coordinates, placed by a turn about it and a translation.
 
+    In own coordinates, `intersect` gives distances [R] along rays from `origin` [3] in `directions` [R, 3], infinite
+    where they miss it, and `normal` outward unit normals [R, 3] at surface points.
+
     Args:
         size: radius, or of a box half of each side [3].
         texture: colours of surface points.
@@ -61,14 +65,6 @@ class Solid:
         """[3, 3] own to world."""
         cos, sin = np.cos(self.turn), np.sin(self.turn)
         return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]], dtype=np.float32)
-
-    def intersect(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """[R] distances along rays from `origin` [3] in `directions` [R, 3], in own coordinates; inf where missed."""
-        raise NotImplementedError
-
-    def normal(self, points: np.ndarray) -> np.ndarray:
-        """[R, 3] outward unit normals at surface points, in own coordinates."""
-        raise NotImplementedError
 
 
 class Sphere(Solid):
@@ -125,32 +121,30 @@ def noise(size: float, first: np.ndarray, second: np.ndarray, random: np.random.
     return colors
 
 
-def demo_solids(random: np.random.Generator) -> list[Solid]:
+def demo_solids(random: np.random.Generator) -> list[Sphere | Box | Disc]:
     """Five solids on a round table; colours, textures and turns are drawn from `random`."""
+
+    turn, vector = partial(random.uniform, 0, np.pi), partial(np.array, dtype=np.float32)
 
     def color() -> np.ndarray:
         return random.uniform(0.1, 0.95, 3).astype(np.float32)
 
-    def turn() -> float:
-        return float(random.uniform(0, np.pi))
-
     def mixed(size: float) -> Texture:
         return noise(size, color(), color(), random)
 
-    def vector(*values: float) -> np.ndarray:
-        return np.array(values, dtype=np.float32)
-
     return [
-        Disc(1.7, mixed(0.8), vector(0, 0, 0), turn()),
-        Box(vector(0.35, 0.35, 0.45), checker(0.23, color(), color()), vector(0.1, 0.0, 0.45), turn()),
-        Sphere(0.36, mixed(0.5), vector(-0.85, 0.35, 0.36), turn()),
-        Sphere(0.28, checker(0.2, color(), color()), vector(0.55, -0.85, 0.28), turn()),
-        Box(vector(0.4, 0.18, 0.15), mixed(0.4), vector(-0.5, -0.75, 0.15), turn()),
-        Box(vector(0.15, 0.15, 0.3), mixed(0.3), vector(0.8, 0.65, 0.3), turn()),
+        Disc(1.7, mixed(0.8), vector([0, 0, 0]), turn()),
+        Box(vector([0.35, 0.35, 0.45]), checker(0.23, color(), color()), vector([0.1, 0.0, 0.45]), turn()),
+        Sphere(0.36, mixed(0.5), vector([-0.85, 0.35, 0.36]), turn()),
+        Sphere(0.28, checker(0.2, color(), color()), vector([0.55, -0.85, 0.28]), turn()),
+        Box(vector([0.4, 0.18, 0.15]), mixed(0.4), vector([-0.5, -0.75, 0.15]), turn()),
+        Box(vector([0.15, 0.15, 0.3]), mixed(0.3), vector([0.8, 0.65, 0.3]), turn()),
     ]
 
 
-def cast(solids: list[Solid], origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cast(
+    solids: list[Sphere | Box | Disc], origin: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """[R, 3] colours and [R] distances of what rays see; black at infinity where they see nothing."""
     nearest = np.full(len(directions), np.inf, dtype=np.float32)
     owner = np.full(len(directions), -1)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -31,20 +32,12 @@ FARTHEST = 1e15
 """Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
 
 
-@dataclass(frozen=True)
-class PhotoFiles:
-    """The files that V photos are read from.
-
-    Args:
-        paths: V files.
-        file_sizes: [V, 2] int64 (width, height) that they have.
-        sizes: [V, 2] int64 (width, height) to give them, undistorted and reduced.
-        note: on photos of another size than their cameras; empty where there is none.
-    """
+class PhotoFiles(NamedTuple):
+    """The files that V photos are read from, and a note on photos of another size than their cameras."""
 
     paths: list[Path]
-    file_sizes: np.ndarray
-    sizes: np.ndarray
+    file_sizes: np.ndarray  # [V, 2] int64 (width, height)
+    sizes: np.ndarray  # [V, 2] int64 to give them, undistorted and reduced
     note: str = ""
 
 

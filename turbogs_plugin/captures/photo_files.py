@@ -7,9 +7,9 @@ import re
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import NamedTuple
 
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, named, require_printable
 from turbogs_plugin.errors import InputError
@@ -115,18 +115,8 @@ def _files(folder: Path, depth: int) -> list[Path]:
     return files
 
 
-def _ends(name: str) -> list[PurePosixPath]:
-    """The paths below a folder that a name may mean: itself; of a path of the machine that wrote it, absolute or with
-    '..', each of its ends, the longest first. Separators may be Windows' ones."""
-    path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
-    parts = path.parts[1:] if path.anchor else path.parts
-    elsewhere = path.anchor or ".." in parts
-    starts = range(len(parts) if elsewhere else min(1, len(parts)))
-    return [PurePosixPath(*parts[start:]) for start in starts if ".." not in parts[start:]]
-
-
 def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | None:
-    """The path, relative to the scene, of a file that a capture names (`_ends`); None where it is not there.
+    """The path, relative to the scene, of a file that a capture names (`_forms`); None where it is not there.
 
     Args:
         folder: of the scene, that names are relative to.
@@ -138,26 +128,22 @@ def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | 
     return next((form for form in _forms(name, folder) if (scene / form).is_file()), None)
 
 
-def _forms(name: str, folder: str) -> Iterator[str]:
-    """The paths in a scene that a name may mean in a folder; ``images_2/a.png`` is a copy of ``images/a.png``."""
-    inner = PureWindowsPath(name).as_posix().removeprefix(f"{IMAGES}/") if folder in REDUCED else name
-    return ((PurePosixPath(folder) / end).as_posix() for end in _ends(inner))
+def _forms(name: str, folder: str) -> list[str]:
+    """The paths in a scene that a name may mean in a folder: the name there; of a path of the machine that wrote it,
+    absolute or with '..', each of its ends, the longest first. Separators may be Windows' ones. A copy of
+    ``images/a.png`` is ``images_2/a.png``."""
+    path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
+    parts = path.parts[bool(path.anchor) or (folder in REDUCED and path.parts[:1] == (IMAGES,)) :]
+    starts = range(len(parts) if path.anchor or ".." in parts else min(1, len(parts)))
+    return [PurePosixPath(folder, *parts[start:]).as_posix() for start in starts if ".." not in parts[start:]]
 
 
-@dataclass(frozen=True)
-class FoundPhotos:
-    """The photos of a capture that are there, in the order of their names.
+class FoundPhotos(NamedTuple):
+    """The photos of a capture that are there, in the order of their names, and notes on those that are not."""
 
-    Args:
-        folder: that all of them lie in: one in the scene, else the scene.
-        names: relative to the folder.
-        places: of the photos among the names that the capture has.
-        notes: lines for the user, on photos that are not where the capture says and on those that are nowhere.
-    """
-
-    folder: Path
-    names: tuple[str, ...]
-    places: list[int]
+    folder: Path  # that all of them lie in: one in the scene, else the scene
+    names: tuple[str, ...]  # relative to the folder
+    places: list[int]  # among the names that the capture has
     notes: list[str]
 
 
@@ -265,7 +251,7 @@ def files_below(folder: Path, without: re.Pattern | None = None) -> Iterator[Pur
 
 def _beside(index: Index, name: str, folders: Sequence[str]) -> list[PurePosixPath]:
     """The files of a name's stem in a folder that the name says."""
-    places = {PurePosixPath(folder) / end.parent for folder in folders for end in _ends(name)}
+    places = {PurePosixPath(form).parent for folder in folders for form in _forms(name, folder)}
     return [file for file in index.get(_stem(name), ()) if file.parent in places]
 
 

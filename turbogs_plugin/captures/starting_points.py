@@ -51,11 +51,10 @@ def plain_cloud(file: str) -> tuple[np.ndarray, np.ndarray] | None:
     if Path(file).suffix.lower() != ".ply" or not MODEL_PROPERTIES.isdisjoint(read_vertices(file)):
         return None
     points, colors = read_cloud(Path(file))
-    colors = np.full(points.shape, GREY, np.uint8) if colors is None else colors
     finite = np.isfinite(points).all(axis=1)
     if not finite.any():
         raise InputError(f"{file} has no finite point: export it again")
-    return points[finite], colors[finite]
+    return points[finite], np.full(points.shape, GREY, np.uint8)[finite] if colors is None else colors[finite]
 
 
 def clouds_beside(folders: Sequence[Path], used: Path | None, remedy: str) -> list[str]:
