@@ -103,8 +103,8 @@ class Capture:
         finite = np.isfinite(self.points).all(axis=1)
         if not finite.all():
             if not finite.any():
-                raise InputError(f"{source}: none of {len(finite)} 3D points is finite: {AGAIN}")
-            notes.append(f"{(~finite).sum()} of {len(finite)} points are left out, as they are not finite")
+                raise InputError(f"{source}: none of {len(self.points)} 3D points is finite: {AGAIN}")
+            notes.append(f"{(~finite).sum()} of {len(self.points)} points are left out, as they are not finite")
         return self._with(np.flatnonzero(whole), np.flatnonzero(finite), tuple(notes)) if notes else self
 
     def _with(self, views: np.ndarray, points: np.ndarray, notes: tuple[str, ...]) -> Capture:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,14 +96,12 @@ def read_model(folder: Path, suffix: str) -> ColmapModel:
     read_images, read_points = (_binary_images, _binary_points) if suffix == ".bin" else (_text_images, _text_points)
     known = _cloud_points(points) if points.name == CLOUD else read_points(points)
     model = ColmapModel(_read_cameras(cameras), list(read_images(images)), known)
-    numbers: set[int] = set()
     for image in model.images:
         if image.camera not in model.cameras:
             trouble = f"image {image.number} has camera {image.camera}, which {cameras.name} does not have"
             raise _damaged(images, trouble)
-        if image.number in numbers:
-            raise _damaged(images, f"two images have the number {image.number}")
-        numbers.add(image.number)
+    if twice := [number for number, times in Counter(image.number for image in model.images).items() if times > 1]:
+        raise _damaged(images, f"two images have the number {twice[0]}")
     return ColmapModel(model.cameras, model.images, model.points[np.argsort(model.points["id"], kind="stable")])
 
 
@@ -139,15 +138,9 @@ def read_poses(folder: Path, suffix: str, model: ColmapModel) -> tuple[dict[int,
             if image in poses and kind == SENSORS["CAMERA"]:
                 place = in_rig[rig].get((kind, sensor))
                 poses[image] = from_world if place is None else _viewmat(place) @ from_world
-    others = sum(
-        not np.allclose(own[image], pose, rtol=1e-4, atol=1e-3, equal_nan=True) for image, pose in poses.items()
-    )
-    return poses, (
-        f"poses are of {frames.name}, and {others} of images{suffix} are others: take {frames.name} away if a program "
-        f"moved the images alone"
-        if others
-        else ""
-    )
+    others = sum(not np.allclose(own[image], pose, 1e-4, 1e-3, equal_nan=True) for image, pose in poses.items())
+    remedy = f"take {frames.name} away if a program moved the images alone"
+    return poses, f"poses are of {frames.name}, and {others} of images{suffix} are others: {remedy}" if others else ""
 
 
 def _viewmat(pose: np.ndarray) -> np.ndarray:

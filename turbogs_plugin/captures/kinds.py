@@ -103,10 +103,8 @@ def _no_capture(scene: Path) -> InputError:
         return InputError(where)
     poses, call = other_poses(scene), f"'turbogs reconstruct {shlex.quote(str(scene))} --out SCENE'"
     if photos := find_photos(scene)[1]:
-        known = (
-            f"{poses}; or find them anew" if poses else "nothing that says where they were taken from: find the cameras"
-        )
-        return InputError(f"{scene} has {len(photos)} photos and {known} by {call}, then use SCENE")
+        known = f"{poses}; or" if poses else "nothing that says where they were taken from:"
+        return InputError(f"{scene} has {len(photos)} photos and {known} find the cameras by {call}, then use SCENE")
     return InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
         f"{', a '.join(READERS)}, nor photos; "

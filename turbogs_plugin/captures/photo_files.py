@@ -20,13 +20,19 @@ OTHER_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".
 """Suffixes of photos that at least one of them does not read, and that may stand for others (`_stem`)."""
 NAMED_SUFFIXES = (*PHOTO_SUFFIXES, ".webp", ".avif", ".jp2")
 """Suffixes of files that may stand for a photo that is not where a capture names it, as Pillow reads them."""
+FRAMES_OF_VIDEO = "ffmpeg -i VIDEO -vf fps=2 -q:v 2 PHOTOS/%05d.jpg"
 UNREAD = {
     "convert to JPEG": (*OTHER_SUFFIXES, ".exr", ".hdr", ".raf", ".raw", ".pef", ".jfif", ".jp2", ".gif", ".psd"),
     "it is of a 360 degree camera: export flat views of it": (".insp", ".insv", ".360"),
     "unpack it": (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"),
     "it is Record3D's: 'ns-process-data record3d' makes a capture of it": (".r3d",),
-    "it is a video: take photos out of it, as by  ffmpeg -i VIDEO -vf fps=2 -q:v 2 PHOTOS/%05d.jpg": (
-        *(".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm"),
+    f"it is a video: take photos out of it, as by  {FRAMES_OF_VIDEO}": (
+        ".mp4",
+        ".mov",
+        ".m4v",
+        ".avi",
+        ".mkv",
+        ".webm",
     ),
 }
 """Suffixes of files that are not read, by what to do with them."""
@@ -38,12 +44,7 @@ _MAPS = "(?:mask|matte|depth|disparity|normal|albedo|semantic|seg|segmentation|i
 _MAPS += "(?:[_-]?(?:map|image|vi[sz])s?)?"
 NO_PHOTOS = re.compile(rf"\..*|images_\d+|(?:.*[_. -])?{_MAPS}(?:_\d+)?", re.IGNORECASE)
 """Folders without photos: hidden ones, copies reduced by a factor (``images_4``), masks, maps of depth and others."""
-READ_SO = re.compile(r"\..*|(images|masks)_\d+|masks")
-"""Folders among these that need no word: they are read for what they are, or hidden."""
-MAPS_OF = [
-    re.compile(form, re.IGNORECASE)
-    for form in (rf"(.+?)[._ -]?(?:{_MAPS}|alpha)(?:[_-]?\d+)?", rf"(?:dynamic_)?{_MAPS}[._ -](.+)")
-]
+MAPS_OF = (rf"(.+?)[._ -]?(?:{_MAPS}|alpha)(?:[_-]?\d+)?", rf"(?:dynamic_)?{_MAPS}[._ -](.+)")
 """Stems of files that are no photos where the photo lies beside them that they are made from (the group)."""
 PHOTO_DEPTH = 1
 """Photos are looked for in a folder and in the folders in it. The photos of several captures beside each other lie
@@ -71,7 +72,7 @@ def maps_beside(files: Iterable[Path]) -> list[Path]:
     """Files among these that are masks or maps of others: ``a.jpg.mask.png`` or ``a_depth.png`` beside ``a.jpg``."""
     files = list(files)
     bases = {file.parent / base for file in files for base in (file.name.lower(), file.stem.lower())}
-    matches = ((file, form.fullmatch(file.stem.lower())) for file in files for form in MAPS_OF)
+    matches = ((file, re.fullmatch(form, file.stem.lower())) for file in files for form in MAPS_OF)
     return list(dict.fromkeys(file for file, match in matches if match and file.parent / match[1] in bases))
 
 
@@ -92,7 +93,8 @@ def unread(path: Path, every: bool = False) -> str:
     if maps := [file for file in maps if not file.name.endswith(MASK_OF_NAME)]:
         said.append(f"{len(maps)} files are masks or maps of photos by their names, no photos ({maps[0].name})")
     named_so = (entry for entry in sorted(entries[1:]) if NO_PHOTOS.fullmatch(entry.name))
-    others = [entry for entry in named_so if not READ_SO.fullmatch(entry.name) and find_photos(entry)[1]]
+    read_so = re.compile(r"\..*|(images|masks)_\d+|masks")  # hidden, or read for what they are
+    others = [entry for entry in named_so if not read_so.fullmatch(entry.name) and find_photos(entry)[1]]
     said += [f"{folder.name}/ holds no photos by its name" for folder in others]
     strange = [file.name for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
     if every and strange and not said:
