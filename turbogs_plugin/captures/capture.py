@@ -97,9 +97,9 @@ class Capture:
         ):
             if not ok.all():
                 damage = f"'{self.names[int(np.argmin(ok))]}' has {trouble}"
-                if left.sum() < min(FEWEST_PHOTOS, len(ok)):
+                if left.sum() < min(FEWEST_PHOTOS, len(self.names)):
                     raise InputError(f"{source}: image {damage} ({(~ok).sum()} such images): {AGAIN}")
-                notes.append(f"{(~ok).sum()} of {len(ok)} images are left out as damaged: {damage}")
+                notes.append(f"{(~ok).sum()} of {len(self.names)} images are left out as damaged: {damage}")
         finite = np.isfinite(self.points).all(axis=1)
         if not finite.all():
             if not finite.any():
