@@ -138,13 +138,11 @@ def bytes_of(path: Path) -> bytes:
 
 
 def text_of(path: Path) -> str:
-    """A text file in UTF-8, or in UTF-16 or -32 as Windows' programs write it, with or without a mark; bytes of no text
-    are as `surrogateescape` has them. Raises `InputError` where it cannot be read."""
+    """A text file in UTF-8, or in UTF-16 or -32 as Windows' programs write it, marked or not; other bytes are as
+    `surrogateescape` has them. Raises `InputError` where it cannot be read."""
     content = bytes_of(path)
-    try:
-        text = content.decode(json.detect_encoding(content), "surrogateescape")
-    except ValueError as error:
-        raise InputError(f"cannot read {path} ({str(error)[:200]}): copy or export it again") from error
+    encoding = json.detect_encoding(content)
+    text = content.decode(encoding, "surrogateescape" if encoding.startswith("utf-8") else "replace")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

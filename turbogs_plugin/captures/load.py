@@ -212,7 +212,9 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
     reduction = re.fullmatch(rf"{IMAGES}_(\d+)", capture.photo_folder.name)
     smaller = capture.photo_sizes[0, 0] > 1.5 * sizes[0, 0]
     already = int(reduction[1]) if reduction and smaller else 1
-    targets = reduced_sizes(_undistorted_sizes(capture, sizes), max(1.0, factor / already))
+    pairs = zip(capture.lenses, sizes.tolist(), strict=True)
+    undistorted = np.array([size if lens is None else lens.size_of(size) for lens, size in pairs], dtype=np.int64)
+    targets = reduced_sizes(undistorted, max(1.0, factor / already))
     return PhotoFiles(paths, sizes, targets, note)
 
 
@@ -227,12 +229,6 @@ def _reduced_copies(scene: Path, capture: Capture, factor: int) -> PhotoFiles | 
     if (np.abs(sizes - capture.photo_sizes / factor) > 1.0).any():
         return None
     return PhotoFiles(paths, sizes, sizes)
-
-
-def _undistorted_sizes(capture: Capture, sizes: np.ndarray) -> np.ndarray:
-    """[V, 2] int64: the sizes that photos of these `sizes` [V, 2] have once they are undistorted."""
-    pairs = zip(capture.lenses, sizes.tolist(), strict=True)
-    return np.array([size if lens is None else lens.size_of(size) for lens, size in pairs], dtype=np.int64)
 
 
 def _require_scaled(paths: list[Path], sizes: np.ndarray, expected: np.ndarray) -> str:

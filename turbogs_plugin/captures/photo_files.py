@@ -77,11 +77,8 @@ def maps_beside(files: Iterable[Path]) -> list[Path]:
 
 
 def unread(path: Path, every: bool = False) -> str:
-    """What is not read of the file `path` or in a folder, and what to do; empty where there is nothing.
-
-    Args:
-        every: also files of kinds that captures have nothing to do with.
-    """
+    """What is not read of the file `path` or in a folder, and what to do; empty where there is nothing. `every`: also
+    files of kinds that captures have nothing to do with."""
     entries = [path, *(path.iterdir() if path.is_dir() else ()), *((path / IMAGES).glob("*"))]
     said = [link for entry in sorted(entries) if (link := broken_link(entry))][:1]
     files = [path] if path.is_file() else _files(path, PHOTO_DEPTH)
