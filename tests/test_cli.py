@@ -287,7 +287,7 @@ def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(turbogs, capture, t
 def test_a_reader_that_stops_early_is_no_error():
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "turbogs_plugin", "doctor"]
+    command = [sys.executable, "-m", "turbogs_plugin"]  # the list of commands
     ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False, timeout=120)
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (141, "")
