@@ -67,8 +67,8 @@ def test_every_script_is_run_here():
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_swaps(name, example, thin_capture, capsys):
-    options = example("gsplat_host").Options(str(thin_capture), iterations=8, refine_start_iter=2, refine_every=4)
+def test_swaps(name, example, capture, capsys):
+    options = example("gsplat_host").Options(str(capture), iterations=6, refine_start_iter=2, refine_every=4)
     example(name).main(options)
     reports = [line for line in capsys.readouterr().out.splitlines() if "dB on the test views" in line]
     assert len(reports) == {"density_swap": 2, "optimizer_swap": 3}.get(name, 1)

@@ -129,7 +129,7 @@ def measure_case(case: StatisticsCase, device: torch.device) -> StatisticsErrors
 
 
 def measure_window(device: torch.device, looks: int | None = None) -> StatisticsErrors:
-    """The sums of a window of `looks` views (None: `LOOKS`): squares over eight decades, added one by one in float32."""
+    """The sums of `looks` views (None: `LOOKS`): squares over eight decades, added one by one in float32."""
     generator = torch.Generator().manual_seed(6)
     level = 10 ** (8 * torch.rand(ROWS, generator=generator, dtype=torch.float64) - 18)
     given, exact = GaussianStats.zeros(ROWS, device), GaussianStats.zeros(ROWS, "cpu").map(Tensor.double)

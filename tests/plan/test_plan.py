@@ -13,6 +13,7 @@ from turbogs_plugin.config.sections import AUTO_SETTINGS
 from turbogs_plugin.plan import SceneFacts
 from turbogs_plugin.plan.decisions import RULES, plan_from_facts
 from turbogs_plugin.report.run_report import write_report
+from turbogs_plugin.study import cell as cell_module
 from turbogs_plugin.study.results import StudyFolder
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer
@@ -137,8 +138,10 @@ def test_a_batch_for_more_processes_is_that_of_one_where_there_is_one(name):
     assert two == expected
 
 
-@pytest.mark.parametrize("name", config_names())
-@pytest.mark.parametrize("changes", [{}, {"train_views": 5, "direction_concentration": 1.0}])
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [*((name, {}) for name in config_names()), ("turbogs", {"train_views": 5, "direction_concentration": 1.0})],
+)
 def test_plan_configuration_yaml_and_back(name, changes):
     config = load_config(name, ALL_AUTO)
     plan = plan_from_facts(facts(**changes), config)
@@ -192,8 +195,9 @@ def test_a_planned_run_tells_its_plan_and_does_not_plan_again(turbogs, capture, 
     assert "of 7 photos could be compared" in (stopped / "report.md").read_text()
 
 
-def test_the_ablation_of_leave_outs_plans_each_cell(turbogs, capture, tmp_path):
+def test_the_ablation_of_leave_outs_plans_each_cell(turbogs, capture, tmp_path, monkeypatch):
     """Forced both ways; where things are changes no result."""
+    monkeypatch.setattr(cell_module, "warm_up", lambda *arguments: None)
     variants = ["all-views", "no-ncc", "host-pixels"]
     options = ["--steps", 4, "--device", "cpu", "--scene", capture, "--out", tmp_path / "study"]
     code, _, err = turbogs("ablate", "leave_out", "train.evaluate_at=[]", *options, "--only", *variants)
