@@ -81,11 +81,32 @@ def test_a_bad_setting_is_refused(turbogs, capture, tmp_path, arguments, words):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
-@pytest.mark.parametrize("verb", ["train", "eval", "render"])
-def test_cuda_asked_for_and_absent(turbogs, capture, finished, tmp_path, verb):
-    arguments = [capture, "--out", tmp_path / "run"] if verb == "train" else [finished]
-    assert_refused(turbogs(verb, *arguments, "--device", "cuda"), "CUDA", "--device cpu")
+@pytest.mark.parametrize("words", ["train CAPTURE --out NEW", "train PHOTOS --out NEW", "eval RUN", "render RUN"])
+def test_cuda_asked_for_and_absent(turbogs, capture, finished, tmp_path, monkeypatch, words):
+    """Nothing is decoded before, and no camera looked for."""
+    monkeypatch.setattr(inputs, "load_scene", lambda *_, **__: pytest.fail("the capture was loaded"))
+    monkeypatch.setattr("turbogs_plugin.reconstruct.run.reconstruct_beside", lambda *_: pytest.fail("solved"))
+    places = {"CAPTURE": capture, "PHOTOS": capture / "images", "NEW": tmp_path / "run", "RUN": finished}
+    told = turbogs(*(places.get(word, word) for word in words.split()), "--device", "cuda")
+    assert_refused(told, "CUDA", "--device cpu")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+def test_a_run_of_a_gpu_goes_on_where_there_is_one(turbogs, finished, tmp_path, monkeypatch):
+    folder = Path(shutil.copytree(finished, tmp_path / "run"))
+    (folder / "report.md").unlink()
+    file = folder / "config.yaml"
+    file.write_text(file.read_text().replace("device: cpu", "device: cuda"))
+    monkeypatch.setattr(inputs, "load_scene", lambda *_, **__: pytest.fail("the capture was loaded"))
+    assert_refused(turbogs("train", "--resume", folder), "CUDA", "turbogs doctor")
+
+
+def test_a_capture_that_a_run_has_trained_on_is_not_judged_again(turbogs, finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(inputs, "require_agreement", lambda scene: pytest.fail("judged"))
+    assert turbogs("eval", finished, "--device", "cpu")[0] == 0
+    (Path(shutil.copytree(finished, tmp_path / "run")) / "report.md").unlink()
+    assert turbogs("train", "--resume", tmp_path / "run")[0] == 0
 
 
 def test_an_output_folder_with_another_run_is_left_alone(turbogs, capture, finished):

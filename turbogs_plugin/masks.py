@@ -145,10 +145,8 @@ class PixelMasks:
         keep = samples.filled & images[starts + samples.pixel_ids.long().clamp(min=0)]
         counts = torch.zeros_like(samples.tile_ids).index_add_(0, samples.tile_of_slot(), keep.int())
         left = counts > 0
-        weights = None
-        if samples.weights is not None:
-            weights = samples.weights[keep]
-            weights = weights / weights.mean()
+        weights = None if samples.weights is None else samples.weights[keep]
+        weights = None if weights is None else weights / weights.mean()
         offsets = torch.nn.functional.pad(counts[left].cumsum(dim=0), (1, 0)).int()
         kept = (samples.pixel_ids[keep], samples.tile_ids[left], offsets, weights)
         return PixelSamples(samples.view_ids, samples.sizes, *kept, has_empty_slots=False)

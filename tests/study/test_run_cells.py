@@ -241,7 +241,7 @@ def test_the_digest_of_a_capture_is_of_names_and_sizes(capture):
 
 def test_a_cell_has_the_planned_length_and_keeps_a_cap_on_gaussians(tmp_path, monkeypatch):
     scene = load_scene(tiny_capture(tmp_path))
-    monkeypatch.setitem(RULES, "train.iterations", lambda facts, config: (6, "few"))
+    monkeypatch.setitem(RULES, "iterations", lambda facts, config: (6, "few"))
     capped = ["train.iterations=auto", "density.max_gaussians=90"]
     result = train_cell("x", load_config("turbogs", [*TINY, *capped]), scene, torch.device("cpu"), provenance("cpu"))
     assert result.final["iteration"] == 6 == result.planned["train.iterations"]

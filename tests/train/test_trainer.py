@@ -97,7 +97,7 @@ STOPS = {
 def test_a_run_stopped_again_and_again_is_the_same_bit_for_bit(capture, whole, tmp_path, monkeypatch):
     """At every stop, the first before the first iteration, and at its end."""
     config = tiny_config(capture).without_plan()
-    trainer = Trainer(config, open_scene(config), torch.device("cpu"))
+    trainer = Trainer(config, open_scene(config.scene, True), torch.device("cpu"))
     initialise, place = Trainer.initialise_maps, tmp_path / "run"
 
     def interrupted(trainer):

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.device import on_device
 from turbogs_plugin.errors import InputError
 
 TILE_SIZE = 16
@@ -37,12 +38,6 @@ def _starts(sizes: bytes, origin: tuple[int, int]) -> tuple[int, ...]:
     """`TileGrid.starts` of these int64 sizes. The result is kept, as iterations ask for few sizes again and again."""
     grid = TileGrid(np.frombuffer(sizes, dtype=np.int64).reshape(-1, 2), origin)
     return 0, *grid.shapes.prod(axis=1).cumsum().tolist()
-
-
-def on_device(numbers: Sequence[int] | np.ndarray, device: torch.device) -> Tensor:
-    """Numbers of the host as a tensor on a device, sent to a GPU without waiting for it."""
-    tensor = torch.as_tensor(numbers)
-    return tensor if device.type == "cpu" else tensor.pin_memory().to(device, non_blocking=True)
 
 
 @dataclass
