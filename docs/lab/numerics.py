@@ -180,8 +180,8 @@ def solvers_table(results: Sequence[SolverErrors], times: Times) -> str:
     rows = []
     for views in VIEWS:
         for family in FAMILIES:
-            own = [result for result in results if (result.views, result.family) == (views, family.name)]
-            rows.append([str(views), family.name, *(result.text() for result in own)])
+            own = (result.text() for result in results if (result.views, result.family) == (views, family.name))
+            rows.append([str(views), family.name, *own])
     rows += [[str(views), "time a system", *(f"{times[name, views]:.0f} ns" for name in SOLVERS)] for views in VIEWS]
     return table(("rows K", f"systems of {SIZE} x {SIZE}", *SOLVERS), rows)
 
