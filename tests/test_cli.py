@@ -255,7 +255,7 @@ def test_a_finished_run_is_evaluated_rendered_and_exported(turbogs, finished, tm
     assert code == 0 and "view_000.png" in out and "not computed" in out and "iteration 2" in out
     code, out, _ = turbogs("render", finished, "--device", "cpu", "--split", "train")
     images = sorted((finished / "renders" / "train").iterdir())
-    assert code == 0 and len(images) == 7 and Image.open(images[0]).size == (48, 40)
+    assert code == 0 and len(images) == 7 and Image.open(images[0]).size == (40, 24)
     code, out, _ = turbogs("export", finished, "--format", "ply", "--out", tmp_path / "mine.ply")
     assert code == 0 and (tmp_path / "mine.ply").read_bytes() == (finished / "model.ply").read_bytes()
     assert_refused(turbogs("export", finished, "--out", tmp_path / "mine.ply"), "exists")
@@ -273,10 +273,10 @@ def test_depth_images_are_in_the_captures_own_units(turbogs, capture, finished):
     cameras.viewmats[:, :3, 3] = cameras.viewmats[:, :3, 3] * frame.scale - cameras.viewmats[:, :3, :3] @ center
     for view, stem in enumerate(distinct_stems(loaded.test.names)):
         depths = np.load(folder / f"{stem}.npy")
-        assert depths.dtype == np.float32 and depths.shape == (40, 48)
+        assert depths.dtype == np.float32 and depths.shape == (24, 40)
         expected = render_image(model, cameras, view, with_depth=True).depths.numpy()
         assert np.median(np.abs(depths - expected)) < 1e-4 * np.median(expected)
-        assert Image.open(folder / f"{stem}.png").size == (48, 40)
+        assert Image.open(folder / f"{stem}.png").size == (40, 24)
 
 
 def test_version(turbogs):

@@ -104,7 +104,7 @@ def test_bench_step_says_what_it_measured_on(turbogs, capture, ply, tmp_path):
     for entry in report["passes"]:
         assert set(entry["steps"]) == {"iteration", *STEPS}
         assert entry["counts"]["gaussians"] == 500 and 0 < entry["counts"]["touched"] <= 500
-        assert entry["counts"]["pixels"] == entry["views"] * 48 * 40
+        assert entry["counts"]["pixels"] == entry["views"] * 40 * 24
         assert entry["memory_bytes"]["parameters"] > 500 * 4 * 14
         assert entry["lost_iterations"] == 0 and entry["wall"]["median_ms"] > 0
 
@@ -114,7 +114,7 @@ def test_bench_raster_says_what_it_measured_on(turbogs, capture, ply, tmp_path):
     printed, report = bench(turbogs, "raster", tmp_path / "raster.json", *options)
     passes = [(entry["rate"], entry["density_sums"]) for entry in report["passes"]]
     assert passes == [(0.5, False), (1.0, False), (0.1, False), (0.5, True)] and "r=0.50:" in printed
-    assert (report["scene"], report["image_size"], report["model"]) == ("capture", [48, 40], "model.ply")
+    assert (report["scene"], report["image_size"], report["model"]) == ("capture", [40, 24], "model.ply")
 
 
 @pytest.mark.parametrize(

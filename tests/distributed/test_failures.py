@@ -18,10 +18,9 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.framework_runs import ENDLESS, TINY, assert_identical, tiny_config
-from helpers.processes import PRELOADED, comes_true, ended, said, start_ranks
+from helpers.processes import PRELOADED, comes_true, command_line, ended, said, start_ranks
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
-from turbogs_plugin import cli
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.distributed import processes as distributed_processes
 from turbogs_plugin.distributed.processes import joined
@@ -187,9 +186,8 @@ def lost_once(words: list[str]) -> None:
 
     if os.environ["RANK"] == "1" and os.environ["TORCHELASTIC_RESTART_COUNT"] == "0":
         Trainer.step = killed
-    sys.argv = ["turbogs", *words]
     with pytest.raises(SystemExit) as end:
-        cli.main()
+        command_line(words)
     assert not end.value.code, end.value.code
 
 

@@ -139,7 +139,7 @@ def test_damaged_masks(capture, tmp_path):
     folder = shutil.copytree(capture, tmp_path / "capture")
     name, choice, refused = f"{sorted((folder / 'images').iterdir())[2].stem}.png", random.Random(8), 0
     (folder / "masks").mkdir()
-    mask = np.random.default_rng(0).integers(0, 2, (40, 48)).astype(np.uint8) * 255
+    mask = np.random.default_rng(0).integers(0, 2, (24, 40)).astype(np.uint8) * 255
     Image.fromarray(mask).save(folder / "masks" / name)
     content = (folder / "masks" / name).read_bytes()
     bomb = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x7f\xff\xff\xff\x7f\xff\xff\xff" + content[24:]

@@ -164,8 +164,8 @@ def test_masks_of_one_pixel(variant, tmp_path, unit):
     """Of every training photo one pixel is left: it is drawn in each iteration, as often as there are views of it."""
 
     def keep(number: int) -> np.ndarray:
-        mask = np.zeros((40, 48), dtype=bool)
-        mask[5 * (number % 7), 6 * number] = True
+        mask = np.zeros((24, 40), dtype=bool)
+        mask[3 * (number % 7), 5 * number] = True
         return mask
 
     write_masks(variant, keep)
@@ -176,10 +176,10 @@ def test_masks_of_one_pixel(variant, tmp_path, unit):
 
 def test_a_view_masked_whole(variant, tmp_path):
     """Left out; the maps of one that is not (a trainer's own masks) stay as they are, and it gives no sample."""
-    write_masks(variant, lambda number: np.full((40, 48), number % 3 != 2))
+    write_masks(variant, lambda number: np.full((24, 40), number % 3 != 2))
     scene = load_scene(variant)
     assert len(scene.train) == 5 and scene.train.masks is None
-    masks = [torch.full((40, 48), number > 0) for number in range(5)]
+    masks = [torch.full((24, 40), number > 0) for number in range(5)]
     trainer = Trainer(
         small_config(variant).without_plan(),
         replace(scene, train=replace(scene.train, masks=PixelMasks.from_images(masks))),
@@ -191,7 +191,7 @@ def test_a_view_masked_whole(variant, tmp_path):
         for views in ((0,), (0, 3)):
             trainer.view_sampler.select = lambda *_, views=views: views
             trainer.step()
-    assert not trainer.maps.errors[: 40 * 48].any() and (trainer.maps.stamps[: 40 * 48] == -1).all()
+    assert not trainer.maps.errors[: 24 * 40].any() and (trainer.maps.stamps[: 24 * 40] == -1).all()
     assert int(trainer.nonfinite_losses) == int(trainer.optimizer.skipped) == 0
     trainer.require_finite()
 

@@ -288,7 +288,7 @@ class OwnSampler(PixelSampler):
     """A sampler that forgets which views it was asked for."""
 
     def sample(self, maps, view_ids, rate, step):
-        return PixelSamples.from_mask(torch.ones(len(view_ids), 40, 48, dtype=torch.bool))
+        return PixelSamples.from_mask(torch.ones(len(view_ids), 24, 40, dtype=torch.bool))
 
 
 class OwnLoss(SparseLoss):

@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import TINY, assert_identical
-from helpers.processes import comes_true, ended, said, start_ranks
+from helpers.processes import comes_true, command_line, ended, said, start_ranks
 from helpers.viewer_client import ViewerClient
 
-from turbogs_plugin import cli
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.viewer.camera import ViewerCamera
@@ -125,9 +124,8 @@ def shown_until_ctrl_c(words: list[str], told: Path) -> None:
     """In a process of its own: the command. A shell starts what it puts into the background with SIGINT ignored, and
     children inherit that."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    sys.argv = ["turbogs", *words]
     with told.open("w", buffering=1) as sys.stdout:
-        cli.main()
+        command_line(words)
 
 
 def test_a_command_with_a_viewer_shows_the_model_until_ctrl_c(capture, tmp_path):
