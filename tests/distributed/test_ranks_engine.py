@@ -63,9 +63,9 @@ def masked(capture: Path) -> Path:
     folder = capture.parent / "masked"
     shutil.copytree(capture, folder)
     (folder / "masks").mkdir()
-    y, x = np.mgrid[0:40, 0:48]
+    y, x = np.mgrid[0:24, 0:40]
     for view, photo in enumerate(sorted((folder / "images").iterdir())):
-        keep = ((x - 12 - view) ** 2 + (y - 14) ** 2 < 11**2) & (view != 3)
+        keep = ((x - 12 - view) ** 2 + (y - 12) ** 2 < 9**2) & (view != 3)
         Image.fromarray(keep).save(folder / "masks" / f"{photo.stem}.png")
     return folder
 
