@@ -53,19 +53,6 @@ def example(monkeypatch):
             del sys.modules[name]
 
 
-def test_every_script_is_run_here():
-    scripts = {path.stem for path in EXAMPLES.glob("*.py")}
-    assert scripts == {
-        *SCRIPTS,
-        "image_fitting",
-        "pixels_on_an_mlp",
-        "baselines",
-        "gsplat_host",
-        "undistort_with_colmap",
-        "many_photos",
-    }
-
-
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_swaps(name, example, capture, capsys):
     options = example("gsplat_host").Options(str(capture), iterations=6, refine_start_iter=2, refine_every=4)
