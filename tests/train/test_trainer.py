@@ -28,6 +28,7 @@ from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.inputs import open_scene
+from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import LossOutput, PixelSamples, RowUpdate
 from turbogs_plugin.yaml_json import parse_yaml
@@ -55,6 +56,9 @@ def test_a_run_leaves_everything_that_it_promises(whole, capture):
     assert history[-1]["psnr"] > history[0]["psnr"] + 1.0
     assert [line["train_seconds"] for line in history] == sorted(line["train_seconds"] for line in history)
     assert history[-1]["nonfinite_losses"] == history[-1]["skipped_updates"] == 0
+    test = load_scene(capture).test
+    measured = evaluate(whole.trainer.gaussians, test, whole.trainer.look(test.names))
+    assert history[-1]["psnr"] == pytest.approx(measured.mean.psnr) and len(measured.views) == 1
 
     page = folder.report.read_text()
     said = ("LPIPS was not computed", "FPS")
