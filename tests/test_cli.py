@@ -40,9 +40,7 @@ def finished(capture, tmp_path_factory) -> Path:
     """A finished run, made by the command itself."""
     folder = tmp_path_factory.mktemp("cli-runs") / "run"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(
-            sys, "argv", ["turbogs", "train", *map(str, (capture, "--out", folder, "--device", "cpu", *QUICK))]
-        )
+        patch.setattr(sys, "argv", ["turbogs", "train", str(capture), "--out", str(folder), "--device", "cpu", *QUICK])
         cli.main()
     assert not end.value.code
     return folder
@@ -151,9 +149,7 @@ def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch):
 )
 def test_overrides_stand_anywhere(turbogs, capture, monkeypatch, order):
     seen = []
-    monkeypatch.setattr(
-        run, "plan_run", lambda config, processes: seen.append(config.train) or SimpleNamespace(text=str)
-    )
+    monkeypatch.setattr(run, "plan_run", lambda config, count: seen.append(config.train) or SimpleNamespace(text=str))
     code, _, error = turbogs(*order.replace("SCENE", str(capture)).split())
     assert code == 0, error
     assert [(train.seed, train.iterations) for train in seen] == [(5, 7)]

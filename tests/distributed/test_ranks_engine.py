@@ -226,9 +226,7 @@ def test_a_step_is_that_of_one_process_up_to_summation(several, alone, case):
     given = dict(leaves(results[case]["density"], "density"))
     for name, value in leaves(alone[case]["density"], "density"):
         if isinstance(value, Tensor):
-            torch.testing.assert_close(
-                given[name], value, rtol=1e-3, atol=1e-4, msg=lambda text, name=name: name + text
-            )
+            torch.testing.assert_close(given[name], value, rtol=1e-3, atol=1e-4, msg=lambda t, name=name: name + t)
 
 
 @pytest.mark.parametrize("case", WITH_EVENTS)

@@ -10,9 +10,7 @@ def solve_exactly(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -
     Args:
         rows, weights, damping, rhs: [K, n, D], [K, n], [n, D], [n, D], as the solvers take them.
     """
-    rows, weights, damping, rhs = (
-        value.double().numpy().astype(np.longdouble) for value in (rows, weights, damping, rhs)
-    )
+    rows, weights, damping, rhs = (v.double().numpy().astype(np.longdouble) for v in (rows, weights, damping, rhs))
     scale, size = 1 / np.sqrt(damping), damping.shape[1]
     scaled = rows * scale * np.sqrt(weights)[..., None]
     identity = np.broadcast_to(np.eye(size, dtype=np.longdouble), (len(rhs), size, size))

@@ -99,9 +99,7 @@ def test_a_study_is_complete_and_goes_on_where_it_stopped(turbogs, small, captur
     results = StudyFolder(out).read_study().results
     first = results[0]
     assert first.final["iteration"] == 4 and first.provenance.machine
-    assert all(result.final["cell_seconds"] > result.final["seconds"] for result in results), (
-        "and the capture's loading"
-    )
+    assert all(each.final["cell_seconds"] > each.final["seconds"] for each in results), "and the loading"
     page = (out / "report.md").read_text()
     mean = np.mean([result.final["psnr"] for result in results[2:]])
     for word in (f"| {mean:.2f} ± ", "a \\| bar", "★", "error-over-time.png", "LPIPS was not"):
