@@ -161,17 +161,10 @@ class PixelSamples:
             tile_ids = self.tile_ids[tiles.start - first : tiles.stop - first]
         else:
             tile_ids = self.tile_ids[tiles] - first
-        return PixelSamples(
-            self.view_ids[views],
-            self.sizes[views],
-            self.pixel_ids[slots],
-            tile_ids,
-            tile_offsets - slots.start if slots.start else tile_offsets,
-            None if self.weights is None else self.weights[slots],
-            self.has_empty_slots,
-            host_ends=None,
-            origin=self.origin,
-        )
+        tile_offsets = tile_offsets - slots.start if slots.start else tile_offsets
+        weights = None if self.weights is None else self.weights[slots]
+        parts = self.pixel_ids[slots], tile_ids, tile_offsets, weights, self.has_empty_slots
+        return PixelSamples(self.view_ids[views], self.sizes[views], *parts, origin=self.origin)
 
     @property
     def filled(self) -> Tensor:
