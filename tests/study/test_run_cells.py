@@ -188,16 +188,23 @@ def test_a_cell_with_a_time_budget_is_trained_as_a_run_with_one(small, capture, 
     assert cell.planned["train.iterations"] != cell.settings["train.iterations"]
 
 
-def test_two_workers_train_each_cell_once(small, tmp_path, monkeypatch, capfd):
+def told_to_a_file(gpu: int, gpus: int, arguments: tuple) -> list[str]:
+    """`run_cells._work`, told to a file: the server of these processes has the stderr of the test that started it."""
+    with (arguments[2].path.parent / f"told-{gpu}").open("w") as sys.stderr:
+        return run_cells._work(gpu, gpus, arguments)
+
+
+def test_two_workers_train_each_cell_once(small, tmp_path, monkeypatch):
     """Forked from a server that has torch, where the command starts Python; what they are told is pickled in both."""
     capture, server = tiny_capture(tmp_path), multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(PRELOADED)
     monkeypatch.setattr(multiprocessing, "get_context", {"spawn": server}.__getitem__)
+    monkeypatch.setattr(run_cells, "_work", told_to_a_file)
     arguments = call(small, capture, tmp_path / "study", "--seeds", "0", "1", "--gpus", "2")
     monkeypatch.setattr(sys, "argv", ["turbogs", *map(str, arguments)])
     with pytest.raises(SystemExit) as end:
         cli.main()
-    told = capfd.readouterr().err
+    told = "".join(path.read_text() for path in tmp_path.glob("told-*"))
     assert not end.value.code, told
     study = StudyFolder(tmp_path / "study").read_study()
     assert len(study.results) == 4
