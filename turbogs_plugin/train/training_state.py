@@ -126,8 +126,8 @@ class TrainingState:
         """[H * W] the errors of a dense render of one view; 0 at masked pixels."""
         background, masks = self.background.at(self.now), self.maps.masks
         samples = dense_samples(self.views.cameras, [view_id]) if masks is None else masks.pixels([view_id])
-        look = Look(self.sh_degree, self.config.raster, background)
-        rendered = rasterize(self.gaussians, self.views.cameras.select([view_id]), samples, **look.options)
+        options = {"sh_degree": self.sh_degree, "settings": self.config.raster, "background": background}
+        rendered = rasterize(self.gaussians, self.views.cameras.select([view_id]), samples, **options)
         truth = self.views.photos.at(samples, background).colors()  # [P, 3]
         errors = truth.new_zeros(int(self.maps.sizes[view_id].prod()))
         errors[samples.pixel_ids.long()] = (self.shown(rendered.colors, samples) - truth).abs().sum(dim=-1)
