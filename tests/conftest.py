@@ -29,7 +29,7 @@ def disks_are_not_waited_for() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> Path:
-    """A folder of 7 training photos and a test photo of 48x40. Not to be changed."""
+    """A folder of 7 training photos and a test photo of 40x24. Not to be changed."""
     from helpers.framework_runs import tiny_capture
 
     return tiny_capture(tmp_path_factory.mktemp("tiny"))

@@ -40,9 +40,7 @@ def finished(capture, tmp_path_factory) -> Path:
     """A finished run, made by the command itself."""
     folder = tmp_path_factory.mktemp("cli-runs") / "run"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(
-            sys, "argv", ["turbogs", "train", *map(str, (capture, "--out", folder, "--device", "cpu", *QUICK))]
-        )
+        patch.setattr(sys, "argv", ["turbogs", "train", str(capture), "--out", str(folder), "--device", "cpu", *QUICK])
         cli.main()
     assert not end.value.code
     return folder
@@ -81,11 +79,32 @@ def test_a_bad_setting_is_refused(turbogs, capture, tmp_path, arguments, words):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
-@pytest.mark.parametrize("verb", ["train", "eval", "render"])
-def test_cuda_asked_for_and_absent(turbogs, capture, finished, tmp_path, verb):
-    arguments = [capture, "--out", tmp_path / "run"] if verb == "train" else [finished]
-    assert_refused(turbogs(verb, *arguments, "--device", "cuda"), "CUDA", "--device cpu")
+@pytest.mark.parametrize("words", ["train CAPTURE --out NEW", "train PHOTOS --out NEW", "eval RUN", "render RUN"])
+def test_cuda_asked_for_and_absent(turbogs, capture, finished, tmp_path, monkeypatch, words):
+    """Nothing is decoded before, and no camera looked for."""
+    monkeypatch.setattr(inputs, "load_scene", lambda *_, **__: pytest.fail("the capture was loaded"))
+    monkeypatch.setattr("turbogs_plugin.reconstruct.run.reconstruct_beside", lambda *_: pytest.fail("solved"))
+    places = {"CAPTURE": capture, "PHOTOS": capture / "images", "NEW": tmp_path / "run", "RUN": finished}
+    told = turbogs(*(places.get(word, word) for word in words.split()), "--device", "cuda")
+    assert_refused(told, "CUDA", "--device cpu")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+def test_a_run_of_a_gpu_goes_on_where_there_is_one(turbogs, finished, tmp_path, monkeypatch):
+    folder = Path(shutil.copytree(finished, tmp_path / "run"))
+    (folder / "report.md").unlink()
+    file = folder / "config.yaml"
+    file.write_text(file.read_text().replace("device: cpu", "device: cuda"))
+    monkeypatch.setattr(inputs, "load_scene", lambda *_, **__: pytest.fail("the capture was loaded"))
+    assert_refused(turbogs("train", "--resume", folder), "CUDA", "turbogs doctor")
+
+
+def test_a_capture_that_a_run_has_trained_on_is_not_judged_again(turbogs, finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(inputs, "require_agreement", lambda scene: pytest.fail("judged"))
+    assert turbogs("eval", finished, "--device", "cpu")[0] == 0
+    (Path(shutil.copytree(finished, tmp_path / "run")) / "report.md").unlink()
+    assert turbogs("train", "--resume", tmp_path / "run")[0] == 0
 
 
 def test_an_output_folder_with_another_run_is_left_alone(turbogs, capture, finished):
@@ -130,9 +149,7 @@ def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch):
 )
 def test_overrides_stand_anywhere(turbogs, capture, monkeypatch, order):
     seen = []
-    monkeypatch.setattr(
-        run, "plan_run", lambda config, processes: seen.append(config.train) or SimpleNamespace(text=str)
-    )
+    monkeypatch.setattr(run, "plan_run", lambda config, count: seen.append(config.train) or SimpleNamespace(text=str))
     code, _, error = turbogs(*order.replace("SCENE", str(capture)).split())
     assert code == 0, error
     assert [(train.seed, train.iterations) for train in seen] == [(5, 7)]
@@ -234,7 +251,7 @@ def test_a_finished_run_is_evaluated_rendered_and_exported(turbogs, finished, tm
     assert code == 0 and "view_000.png" in out and "not computed" in out and "iteration 2" in out
     code, out, _ = turbogs("render", finished, "--device", "cpu", "--split", "train")
     images = sorted((finished / "renders" / "train").iterdir())
-    assert code == 0 and len(images) == 7 and Image.open(images[0]).size == (48, 40)
+    assert code == 0 and len(images) == 7 and Image.open(images[0]).size == (40, 24)
     code, out, _ = turbogs("export", finished, "--format", "ply", "--out", tmp_path / "mine.ply")
     assert code == 0 and (tmp_path / "mine.ply").read_bytes() == (finished / "model.ply").read_bytes()
     assert_refused(turbogs("export", finished, "--out", tmp_path / "mine.ply"), "exists")
@@ -252,10 +269,10 @@ def test_depth_images_are_in_the_captures_own_units(turbogs, capture, finished):
     cameras.viewmats[:, :3, 3] = cameras.viewmats[:, :3, 3] * frame.scale - cameras.viewmats[:, :3, :3] @ center
     for view, stem in enumerate(distinct_stems(loaded.test.names)):
         depths = np.load(folder / f"{stem}.npy")
-        assert depths.dtype == np.float32 and depths.shape == (40, 48)
+        assert depths.dtype == np.float32 and depths.shape == (24, 40)
         expected = render_image(model, cameras, view, with_depth=True).depths.numpy()
         assert np.median(np.abs(depths - expected)) < 1e-4 * np.median(expected)
-        assert Image.open(folder / f"{stem}.png").size == (48, 40)
+        assert Image.open(folder / f"{stem}.png").size == (40, 24)
 
 
 def test_version(turbogs):
@@ -287,7 +304,7 @@ def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(turbogs, capture, t
 def test_a_reader_that_stops_early_is_no_error():
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "turbogs_plugin", "doctor"]
+    command = [sys.executable, "-m", "turbogs_plugin"]  # the list of commands
     ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False, timeout=120)
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (141, "")

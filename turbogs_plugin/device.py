@@ -1,12 +1,21 @@
-"""Devices as a whole: wait for them, measure their peak memory, free what is unused, count the processor's cores."""
+"""Devices: numbers sent to them, waits for them, peak memory, unused memory freed; the processor's cores."""
 
 from __future__ import annotations
 
 import gc
 import os
 import sys
+from collections.abc import Sequence
 
+import numpy as np
 import torch
+from torch import Tensor
+
+
+def on_device(numbers: Sequence[int] | np.ndarray, device: torch.device) -> Tensor:
+    """Numbers of the host as a tensor on a device, sent to a GPU without waiting for it."""
+    tensor = torch.as_tensor(numbers)
+    return tensor if device.type == "cpu" else tensor.pin_memory().to(device, non_blocking=True)
 
 
 def synchronize(device: torch.device) -> None:

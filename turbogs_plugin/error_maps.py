@@ -5,14 +5,8 @@ iteration of its last visit is stored, its "stamp". Stamps give the ages of the 
 sampled pixels have to be written. The sum of a view's errors is updated incrementally. Errors are stored in half
 precision and their sums in double, so the sums are exact (below 2^29 a view) and do not drift.
 
-Without Gaussians, from plain error images::
-
-    maps = ErrorMaps.from_images(errors)                                 # [V, H, W], or a list of [H, W]
-    step = Step(iteration=t, total=1000, refine_until=1000)
-    samples = ErrorGuidedPixelSampler().sample(maps, (4, 2), 0.1, step)  # a tenth of views 4 and 2
-    maps.update(samples, new_errors, step)                               # [P]
-
-With masks, a masked pixel has no error, is never drawn, and does not count in any mean.
+With masks, a masked pixel has no error, is never drawn, and does not count in any mean. docs/drop-in.md has an example
+without Gaussians, from plain error images.
 """
 
 from __future__ import annotations
@@ -200,9 +194,8 @@ class ErrorMaps:
         """[V] float64 on the host: mean error of each view, over its pixels that are not masked; 0 if all are.
 
         On the CPU they are exact. Elsewhere reading them at every call would stall the device, so a copy is started at
-        every `refresh`-th call and read at the next such call. The means are therefore between `refresh` and
-        ``2 * refresh - 1`` calls old (between 0 and ``2 * refresh - 1`` after the first call or `initialise`, which
-        wait for the device). They depend on the number of calls alone, never on timing.
+        every `refresh`-th call and read at the next such call: means are at most ``2 * refresh - 1`` calls old, and
+        depend on the number of calls alone, never on timing. The first call, also after `initialise`, waits.
         """
         return np.maximum(self._means.read(), 0.0) / self._pixel_counts
 

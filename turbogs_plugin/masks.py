@@ -22,7 +22,6 @@ WORD_BITS = 32
 WORDS = TILE_PIXELS // WORD_BITS
 """32-bit words of a tile's bits; bit n of word j is the pixel with `sample_order` 32 j + n."""
 
-
 _PLACES = pixel_table(np.full((1, 2), TILE_SIZE), "cpu")[0].numpy()
 """[256] int32: the pixel, counted row by row, that each place of a tile in `sample_order` has."""
 
@@ -145,10 +144,7 @@ class PixelMasks:
         keep = samples.filled & images[starts + samples.pixel_ids.long().clamp(min=0)]
         counts = torch.zeros_like(samples.tile_ids).index_add_(0, samples.tile_of_slot(), keep.int())
         left = counts > 0
-        weights = None
-        if samples.weights is not None:
-            weights = samples.weights[keep]
-            weights = weights / weights.mean()
+        weights = None if samples.weights is None else samples.weights[keep] / samples.weights[keep].mean()
         offsets = torch.nn.functional.pad(counts[left].cumsum(dim=0), (1, 0)).int()
         kept = (samples.pixel_ids[keep], samples.tile_ids[left], offsets, weights)
         return PixelSamples(samples.view_ids, samples.sizes, *kept, has_empty_slots=False)

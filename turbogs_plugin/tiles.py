@@ -118,15 +118,9 @@ def compact(
 def dense_pixels(view_ids: Sequence[int], sizes: np.ndarray, device: torch.device | str) -> PixelSamples:
     """Every pixel of these views, in the order of samples. `sizes`: [K, 2] int64 (width, height)."""
     pixel_ids, offsets = _dense(np.ascontiguousarray(sizes, dtype=np.int64).tobytes(), torch.device(device))
-    return PixelSamples(
-        view_ids=tuple(view_ids),
-        sizes=sizes,
-        pixel_ids=pixel_ids,
-        tile_ids=torch.arange(len(offsets) - 1, dtype=torch.int32, device=device),
-        tile_offsets=offsets,
-        has_empty_slots=False,
-        host_ends=lambda: (np.array(TileGrid(sizes).starts[1:]), np.cumsum(tile_areas(sizes))),
-    )
+    tile_ids = torch.arange(len(offsets) - 1, dtype=torch.int32, device=device)
+    ends = DrawEnds("pixel", tuple(map(tuple, sizes.tolist())), (TILE_PIXELS,) * len(sizes))
+    return PixelSamples(tuple(view_ids), sizes, pixel_ids, tile_ids, offsets, None, False, ends)
 
 
 @lru_cache(maxsize=16)

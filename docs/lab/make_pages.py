@@ -114,10 +114,8 @@ def draw(data: dict[str, Any]) -> Figure:
             upper.plot(seconds, psnr, **style)
             if gaussians is not None and ssim is not None:
                 lower.plot(gaussians, ssim, **style)
-        best = max(psnr for _, _, psnr, *_ in shown["ends"])
-        upper.set(
-            title=capture, xlabel="seconds of training", xscale="log", xlim=(0.3, 250), ylim=(best - 5, best + 0.4)
-        )
+        top = max(psnr for _, _, psnr, *_ in shown["ends"])
+        upper.set(title=capture, xlabel="seconds of training", xscale="log", xlim=(0.3, 250), ylim=(top - 5, top + 0.4))
         lower.set(xlabel="Gaussians", xscale="log", xlim=(4e4, 2.5e6))
     axes[0, 0].set_ylabel("test PSNR in dB")
     axes[1, 0].set_ylabel("test SSIM")

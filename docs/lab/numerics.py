@@ -22,6 +22,7 @@ from torch import Tensor
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests"))  # the cases are those that the tests hold
 
+from helpers.exact_solver import solve_exactly  # noqa: E402
 from helpers.statistics_errors import CASES, SUMS, StatisticsErrors, measure_case, measure_window  # noqa: E402
 
 from turbogs_plugin.bench.timing import measure  # noqa: E402
@@ -106,22 +107,6 @@ def make_problem(family: Stiffness, views: int, count: int, seed: int) -> Proble
     return (rows * family.size).float(), weights.float(), (damping * family.size).float(), (rhs * family.size).float()
 
 
-def solve_exactly(problem: Problem) -> np.ndarray:
-    """[n, D] longdouble: the scaled unknown sqrt(d) x, by Gauss-Jordan elimination in extended precision, every row at
-    its full length."""
-    rows, weights, damping, rhs = (value.double().numpy().astype(np.longdouble) for value in problem)
-    scale = 1 / np.sqrt(damping)
-    scaled = rows * scale * np.sqrt(weights)[..., None]
-    identity = np.broadcast_to(np.eye(SIZE, dtype=np.longdouble), (len(rhs), SIZE, SIZE))
-    augmented = np.concatenate([identity + np.einsum("kni,knj->nij", scaled, scaled), (rhs * scale)[..., None]], axis=2)
-    for column in range(SIZE):  # no pivoting: the matrix is positive definite
-        augmented[:, column] /= augmented[:, column, column, None]
-        for row in range(SIZE):
-            if row != column:
-                augmented[:, row] -= augmented[:, row, column, None] * augmented[:, column]
-    return augmented[:, :, SIZE]
-
-
 def scaled_errors(solution: Tensor, exact: np.ndarray, problem: Problem) -> np.ndarray:
     """[n] distance of each solution from the exact one, over the length of the step without rows; inf where the
     solution is not finite."""
@@ -167,7 +152,7 @@ def measure_solvers() -> tuple[list[SolverErrors], Times]:
             times[name, views] = 1e6 * measure(partial(solve, *many), REPEATS, CPU)["median_ms"] / BATCH
         for seed, family in enumerate(FAMILIES):
             problem = make_problem(family, views, SYSTEMS, seed)
-            exact = solve_exactly(problem)
+            exact = solve_exactly(*problem)
             for name, solve in SOLVERS.items():
                 errors = scaled_errors(solve(*problem), exact, problem)
                 good = errors[errors <= FAILED_ERROR]
@@ -180,8 +165,8 @@ def solvers_table(results: Sequence[SolverErrors], times: Times) -> str:
     rows = []
     for views in VIEWS:
         for family in FAMILIES:
-            own = [result for result in results if (result.views, result.family) == (views, family.name)]
-            rows.append([str(views), family.name, *(result.text() for result in own)])
+            own = (result.text() for result in results if (result.views, result.family) == (views, family.name))
+            rows.append([str(views), family.name, *own])
     rows += [[str(views), "time a system", *(f"{times[name, views]:.0f} ns" for name in SOLVERS)] for views in VIEWS]
     return table(("rows K", f"systems of {SIZE} x {SIZE}", *SOLVERS), rows)
 

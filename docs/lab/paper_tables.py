@@ -68,10 +68,8 @@ def verdict(pairs: Mapping[str, tuple[Cells, Cells]]) -> str:
             if difference.clear and abs(difference.mean) >= least:
                 said[difference.mean > 0].append(f"{measure.upper()} on {capture}")
     gains, losses = (", ".join(said[better]) for better in (True, False))
-    if gains and losses:
-        text = f"mixed: {gains}, but worse {losses}"
-    else:
-        text = f"better: {gains}" if gains else f"worse: {losses}" if losses else "as good"
+    text = f"better: {gains}" if gains else f"worse: {losses}" if losses else "as good"
+    text = f"mixed: {gains}, but worse {losses}" if gains and losses else text
     dear = []
     for measure, unit in (("seconds", "s"), ("gaussians", "Gaussians")):
         times = statistics.geometric_mean(ratio(*pair, measure) for pair in pairs.values())
@@ -121,8 +119,7 @@ def paper_whole() -> str:
     }
     found = {name: [study_cells(study)[of][variant] for of in CAPTURES] for name, (study, variant) in entries.items()}
     lines = [(name, *map(whole_run, cells)) for name, cells in found.items()]
-    full, paper, *_ = found.values()
-    pairs = list(zip(full, paper, strict=True))
+    pairs = list(zip(*list(found.values())[:2], strict=True))  # 3DGS and `turbogs-paper`
     for name, psnr in (("end", lambda cells: mean(cells, "psnr")), ("best on the way", best_psnr)):
         kept = (within_bound(ours, psnr(theirs)) for theirs, ours in pairs)
         lines.append((f"`turbogs-paper`, its end, minus 3DGS, its {name}", *kept))

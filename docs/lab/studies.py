@@ -104,6 +104,12 @@ class Difference:
         error = statistics.stdev(found) / math.sqrt(count) if count > 1 else math.nan
         return cls(math.fsum(found) / count if count else math.nan, error, count)
 
+    @classmethod
+    def over(cls, parts: Sequence[Difference]) -> Difference:
+        """The mean of captures' differences, with the error that the spread of their seeds gives it."""
+        error = math.hypot(*(part.error for part in parts)) / len(parts)
+        return cls(statistics.fmean(part.mean for part in parts), error, 1 + sum(part.count - 1 for part in parts))
+
     @property
     def clear(self) -> bool:
         """Noise alone gives a mean this large in fewer than 1 of 20 cases."""
@@ -134,8 +140,8 @@ def result(seconds: str, psnr: str, ssim: float | None, gaussians: float | None)
     """``4.1 s, 32.20 dB, .893, 209k``, without what was not recorded."""
     parts = [f"{seconds} s", f"{psnr} dB"]
     parts += [] if ssim is None else [f"{ssim:.3f}".lstrip("0")]
-    if gaussians is not None:
-        parts.append(f"{gaussians / 1e6:.2f}M" if gaussians >= 1e6 else f"{gaussians / 1e3:.0f}k")
+    count = gaussians or 0.0
+    parts += [f"{count / 1e6:.2f}M" if count >= 1e6 else f"{count / 1e3:.0f}k"] if count else []
     return ", ".join(parts)
 
 
@@ -237,9 +243,11 @@ def change(cells: Cells, base: Cells, errors: str = "") -> str:
 
 
 def study_table(study: str, errors: str = "") -> str:
-    """Every variant of a study: seconds of training, errors and Gaussians; below them the change from the baseline."""
+    """Every variant of a study: seconds of training, errors and Gaussians; below them the change from the baseline. In
+    a study of further captures, the mean change over all of them, too."""
     lines: dict[str, dict[str, str]] = {}
-    for capture, by_variant in study_cells(study).items():
+    found = study_cells(study)
+    for capture, by_variant in found.items():
         baseline, *_ = by_variant.values()
         for variant, cells in by_variant.items():
             seconds, ssim = duration(mean(cells, "seconds")), mean(cells, f"{errors}ssim")
@@ -248,4 +256,9 @@ def study_table(study: str, errors: str = "") -> str:
             compared = cells is not baseline and Difference.between(cells, baseline, "psnr").count
             text += f"<br>{change(cells, baseline, errors)}" if compared else ""
             lines.setdefault(variant, {})[capture] = text
+    baseline, *others = lines
+    for variant in others if len(found) > len(CAPTURES) else ():
+        pairs = [(of[variant], of[baseline]) for of in found.values()]
+        psnr, ssim = (Difference.over([Difference.between(*pair, of) for pair in pairs]) for of in ("psnr", "ssim"))
+        lines[variant]["mean change"] = f"{psnr.text(3, ' dB')}, {ssim.text(4)}"
     return by_capture("", lines)

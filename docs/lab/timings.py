@@ -32,8 +32,7 @@ STEPS = {
 
 def on(record: dict[str, Any], made: str) -> str:
     """A table below a line that says what it was measured on."""
-    width, height = record["image_size"]
-    return f"{where(record)}; {record['scene']}, {width}x{height}.\n\n{made}"
+    return f"{where(record)}; {record['scene']}, {'x'.join(map(str, record['image_size']))}.\n\n{made}"
 
 
 def steps(name: str) -> str:
@@ -72,13 +71,10 @@ def ranks() -> str:
         batch, time = round(of["pixel_budget"]), of["wall"]["median_ms"]
         one = alone[of["gaussians"], of["views"] // batch]
         case = f"{of['gaussians'] // 1000}k, K = {of['views'] // batch}{', N times the batch' if batch > 1 else ''}"
-        machine = (
-            "1 GPU" if of["gpus"] == 1 else f"{of['gpus']} GPUs, {of['exchange'].removeprefix('owners of rows, ')}"
-        )
+        exchange = of.get("exchange", "").removeprefix("owners of rows, ")
+        machine = f"{of['gpus']} GPUs, {exchange}" if of["gpus"] > 1 else "1 GPU"
         lines.setdefault(case, {})[machine] = f"{time:.2f} ms, {batch * one / time:.2f}x"
-    machines = [
-        machine for machine in dict.fromkeys(name for of in lines.values() for name in of) if "all" not in machine
-    ]
+    machines = dict.fromkeys(name for of in lines.values() for name in of if "all" not in name)
     rows = [(case, *(found.get(machine, "") for machine in machines)) for case, found in lines.items()]
     return f"{where(record)}.\n\n{table(('an iteration', *machines), rows)}"
 
@@ -122,12 +118,8 @@ def dropin() -> str:
                 seconds = min(end["seconds"], stock[run["scene"]][-1]["seconds"])
                 ours, theirs = (psnr_at(marks, seconds) for marks in (run["marks"], stock[run["scene"]]))
                 beside = f"{ours - theirs:+.2f} dB: {ours:.2f} for {theirs:.2f} at {seconds:.0f} s"
-            texts = (
-                f"{end['seconds']:.1f}",
-                f"{end['psnr']:.2f}",
-                f"{end['ssim']:.4f}",
-                f"{end['gaussians'] / 1e3:.0f}k",
-            )
+            texts = (f"{end[name]:.{digits}f}" for name, digits in (("seconds", 1), ("psnr", 2), ("ssim", 4)))
+            texts = (*texts, f"{end['gaussians'] / 1e3:.0f}k")
             lines.append((run["scene"], SWAPS[run["variant"]], end["step"], *texts, beside))
         head = ("capture", "swap", "steps", "s", "PSNR", "SSIM", "Gaussians", "PSNR beside stock's, equal time")
         parts.append(f"{record['device']}, {record['date']}:\n\n{table(head, lines)}")

@@ -1,15 +1,26 @@
 """`turbogs bench wall`: the command in a process of its own, part by part."""
 
 import json
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from helpers.framework_runs import tiny_capture
+from helpers.processes import command_line, ended, said, start_ranks
 
 from turbogs_plugin.bench import wall
 from turbogs_plugin.bench.wall import REST, WallRun, bench_wall, wall_lines
 
 
-def test_the_parts_of_a_run_are_all_of_its_time(turbogs, tmp_path):
+def forked(command: list[str], tmp_path: Path) -> SimpleNamespace:
+    """The command in a process that has torch already."""
+    (code,) = ended(start_ranks(1, command_line, tmp_path, command[command.index("turbogs_plugin") + 1 :]))
+    return SimpleNamespace(returncode=code, stderr=said(tmp_path))
+
+
+def test_the_parts_of_a_run_are_all_of_its_time(turbogs, tmp_path, monkeypatch):
+    run = SimpleNamespace(run=lambda command, **_: forked(command, tmp_path / "process"), DEVNULL=None, PIPE=None)
+    monkeypatch.setattr(wall, "subprocess", run)
     options = ("train.iterations=2", "train.sh_degree=0", "--device", "cpu", "--repeats", 1)
     code, out, _ = turbogs("bench", "wall", "--scene", tiny_capture(tmp_path), *options, "--out", tmp_path / "w.json")
     assert code == 0

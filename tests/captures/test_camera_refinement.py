@@ -11,7 +11,7 @@ from helpers.tracked import HEIGHT, WIDTH, tracked, write_tracked
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.bundle_adjustment import reprojection_errors
 from turbogs_plugin.captures.camera_refinement import _pinholes, find_cameras, refine_cameras
-from turbogs_plugin.config.configuration import load_config
+from turbogs_plugin.config.sections import SceneConfig
 from turbogs_plugin.distributed.ranks import Ranks
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.model.initial import gaussians_from_points
@@ -74,17 +74,15 @@ def test_training_cameras_are_refined_and_test_cameras_stay(capture, factor):
 
 def test_without_it_test_photos_alone_get_other_cameras_beside_theirs(capture):
     scene = load_scene(capture)
-    same = open_scene(load_config("turbogs", [f"scene.path={capture}", "train.refine_cameras=false"]))
+    same = open_scene(SceneConfig(str(capture)), False)
     assert unchanged(scene, same, "train") and unchanged(scene, same, "test") and same.points.equal(scene.points)
     assert median_error(same, "test", refined=True) < 0.2 < 1.0 < median_error(same, "test")
     assert scene.reprojection_error is None and same.reprojection_error == median_error(same, "train")
-    assert unchanged(refine_cameras(scene), open_scene(load_config("turbogs", [f"scene.path={capture}"])), "train"), (
-        "by default"
-    )
+    assert unchanged(refine_cameras(scene), open_scene(SceneConfig(str(capture)), True), "train"), "by default"
 
 
 def test_of_several_processes_the_first_one_refines_for_all(capture):
-    first = open_scene(load_config("turbogs", [f"scene.path={capture}"]))
+    first = open_scene(SceneConfig(str(capture)), True)
 
     class Second(Ranks):
         rank = 1
@@ -93,7 +91,7 @@ def test_of_several_processes_the_first_one_refines_for_all(capture):
             assert value is None
             return find_cameras(load_scene(capture))
 
-    second = open_scene(load_config("turbogs", [f"scene.path={capture}"]), ranks=Second())
+    second = open_scene(SceneConfig(str(capture)), True, ranks=Second())
     assert unchanged(first, second, "train") and second.points.equal(first.points)
     assert second.test.refined.Ks.equal(first.test.refined.Ks)
 

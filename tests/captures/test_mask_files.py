@@ -13,7 +13,7 @@ from PIL import Image
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.errors import InputError
 
-SIZE = (48, 40)
+SIZE = (40, 24)
 
 
 @pytest.fixture(scope="module")
@@ -135,8 +135,8 @@ def test_a_split_that_is_masked_whole_is_refused(capture, part, views):
 
 def test_a_mask_of_another_size_is_refused(capture):
     photo = photos_of(capture)[2]
-    write_masks(capture, [f"{photo.stem}.png"], half_mask((24, 20)))
-    with pytest.raises(InputError, match=rf"mask .*{photo.stem}.png is 24x20 but photo .*{photo.name} is 48x40: make"):
+    write_masks(capture, [f"{photo.stem}.png"], half_mask((20, 12)))
+    with pytest.raises(InputError, match=rf"mask .*{photo.stem}.png is 20x12 but photo .*{photo.name} is 40x24: make"):
         load_scene(capture)
 
 
@@ -145,7 +145,7 @@ def test_a_reduced_pixel_counts_if_all_of_it_does(capture):
     mask[:, 21:] = 0  # within the 11th reduced column
     mask[10, 2] = 0
     write_masks(capture, [f"{photo.stem}.png" for photo in photos_of(capture)], mask)
-    expected = np.zeros((20, 24), dtype=bool)
+    expected = np.zeros((12, 20), dtype=bool)
     expected[:, :10] = True
     expected[5, 1] = False
     assert_masked(load_scene(capture, factor=2).train, expected)
@@ -155,9 +155,9 @@ def test_a_reduced_pixel_counts_if_all_of_it_does(capture):
 def test_reduced_copies_of_photos_take_full_or_reduced_masks(capture, folder):
     (capture / "images_2").mkdir()
     for photo in photos_of(capture):
-        Image.open(photo).resize((24, 20)).save(capture / "images_2" / photo.name)
+        Image.open(photo).resize((20, 12)).save(capture / "images_2" / photo.name)
     names = [f"{photo.stem}.png" for photo in photos_of(capture)]
-    expected = np.zeros((20, 24), dtype=np.uint8)
+    expected = np.zeros((12, 20), dtype=np.uint8)
     expected[4:, 2:9] = 255
     write_masks(capture, names, expected if folder == "masks_2" else expected.repeat(2, 0).repeat(2, 1), folder)
     if folder == "masks_2":
@@ -181,7 +181,7 @@ def transforms_capture(capture: Path, tmp_path: Path, **of_first) -> Path:
     (folder / "of people").mkdir()
     for frame in frames:
         Image.fromarray(half_mask()).save(folder / "of people" / f"{Path(frame['file_path']).stem}-mask.png")
-    record = {"w": 48, "h": 40, "fl_x": 55.2, "fl_y": 55.2, "frames": frames}
+    record = {"w": 40, "h": 24, "fl_x": 46.0, "fl_y": 46.0, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(record))
     return folder
 

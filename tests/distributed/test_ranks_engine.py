@@ -63,9 +63,9 @@ def masked(capture: Path) -> Path:
     folder = capture.parent / "masked"
     shutil.copytree(capture, folder)
     (folder / "masks").mkdir()
-    y, x = np.mgrid[0:40, 0:48]
+    y, x = np.mgrid[0:24, 0:40]
     for view, photo in enumerate(sorted((folder / "images").iterdir())):
-        keep = ((x - 12 - view) ** 2 + (y - 14) ** 2 < 11**2) & (view != 3)
+        keep = ((x - 12 - view) ** 2 + (y - 12) ** 2 < 9**2) & (view != 3)
         Image.fromarray(keep).save(folder / "masks" / f"{photo.stem}.png")
     return folder
 
@@ -226,9 +226,7 @@ def test_a_step_is_that_of_one_process_up_to_summation(several, alone, case):
     given = dict(leaves(results[case]["density"], "density"))
     for name, value in leaves(alone[case]["density"], "density"):
         if isinstance(value, Tensor):
-            torch.testing.assert_close(
-                given[name], value, rtol=1e-3, atol=1e-4, msg=lambda text, name=name: name + text
-            )
+            torch.testing.assert_close(given[name], value, rtol=1e-3, atol=1e-4, msg=lambda t, name=name: name + t)
 
 
 @pytest.mark.parametrize("case", WITH_EVENTS)

@@ -45,8 +45,7 @@ def seen_views(shares: list[Share], views: int) -> list[int]:
 
 @pytest.mark.parametrize("unit", ["pixel", "tile"])
 @pytest.mark.parametrize("count", [2, 3, 8])
-@pytest.mark.parametrize("views", [1, 3, 6])
-@pytest.mark.parametrize("sizes", [EQUAL, MIXED])
+@pytest.mark.parametrize(("sizes", "views"), [(EQUAL, 1), (EQUAL, 6), (MIXED, 3), (MIXED, 6)])
 @pytest.mark.parametrize("masked", [False, True])
 def test_shares_are_the_samples_in_their_order(sizes, views, count, unit, masked):
     samples = samples_of(sizes, views, unit, masks=half_masked(sizes) if masked else None)

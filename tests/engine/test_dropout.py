@@ -19,9 +19,7 @@ HALF = Dropout(0.5, seed=3, iteration=7)
 @pytest.mark.parametrize("share", [0.01, 0.2, 0.9])
 def test_each_gaussian_has_the_same_chance(share):
     count = 40_000
-    left = [
-        (~kept(Dropout(share, seed, iteration), count, CPU)).double() for seed, iteration in ((0, 1), (0, 2), (1, 1))
-    ]
+    left = [(~kept(Dropout(share, seed, at), count, CPU)).double() for seed, at in ((0, 1), (0, 2), (1, 1))]
     deviation = (share * (1 - share) / count) ** 0.5
     assert all(abs(each.mean() - share) < 5 * deviation for each in left)
     for other in left[1:]:  # drawn anew for another iteration or seed

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from helpers.exact_solver import solve_exactly
 
 from turbogs_plugin.engine.reference.lm_solvers import (
     ROW_LIMIT,
@@ -30,35 +31,10 @@ def systems(views: int, size: int, decades: float, length: float, seed: int = 0,
     return tuple(value.to(dtype) for value in (rows, weights, damping, rhs))
 
 
-def exact(rows, weights, damping, rhs) -> np.ndarray:
-    """[n, D] by Gaussian elimination with pivots, in numpy's extended precision, after scaling."""
-    rows, weights, damping, rhs = (
-        value.double().numpy().astype(np.longdouble) for value in (rows, weights, damping, rhs)
-    )
-    answers = []
-    for i in range(len(rhs)):
-        scale = 1 / np.sqrt(damping[i])
-        matrix = np.eye(len(scale), dtype=np.longdouble)
-        for k in range(len(rows)):
-            matrix += weights[k, i] * np.outer(rows[k, i] * scale, rows[k, i] * scale)
-        target = (rhs[i] * scale).copy()
-        for column in range(len(scale)):
-            pivot = column + np.abs(matrix[column:, column]).argmax()
-            matrix[[column, pivot]], target[[column, pivot]] = matrix[[pivot, column]], target[[pivot, column]]
-            for row in range(column + 1, len(scale)):
-                factor = matrix[row, column] / matrix[column, column]
-                matrix[row] -= factor * matrix[column]
-                target[row] -= factor * target[column]
-        for row in reversed(range(len(scale))):
-            target[row] = (target[row] - matrix[row, row + 1 :] @ target[row + 1 :]) / matrix[row, row]
-        answers.append(target * scale)
-    return np.array(answers)
-
-
 def scaled_error(solution, expected, damping, rhs) -> float:
     """Largest error of the scaled unknown, over the length of the step without rows."""
     root = damping.double().numpy() ** 0.5
-    error = np.linalg.norm((solution.double().numpy() - expected.astype(float)) * root, axis=-1)
+    error = np.linalg.norm(solution.double().numpy() * root - expected.astype(float), axis=-1)
     return float((error / np.linalg.norm(rhs.double().numpy() / root, axis=-1)).max())
 
 
@@ -68,7 +44,7 @@ def scaled_error(solution, expected, damping, rhs) -> float:
 def test_stiff_in_float32(views, solve, decades):
     """Condition numbers to 1e30 of the unscaled system cost nothing: only the scaled one's counts, 1e4 here."""
     problem = systems(views, 10, decades=decades, length=30, dtype=torch.float32)
-    assert scaled_error(solve(*problem), exact(*problem), problem[2], problem[3]) < 2e-3
+    assert scaled_error(solve(*problem), solve_exactly(*problem), problem[2], problem[3]) < 2e-3
 
 
 @pytest.mark.parametrize("solve", STABLE)
@@ -80,7 +56,7 @@ def test_where_cholesky_without_scaling_fails(case, solve):
         problem, tolerance = (rows * 1e18, weights, damping * 1e36, rhs * 1e18), 1e-4
     else:
         problem, tolerance = systems(3, 10, decades=16, length=1e6, dtype=torch.float32), 1e-2  # cut at ROW_LIMIT
-    assert scaled_error(solve(*problem), exact(*problem), problem[2], problem[3]) < tolerance
+    assert scaled_error(solve(*problem), solve_exactly(*problem), problem[2], problem[3]) < tolerance
 
 
 @pytest.mark.parametrize("solve", STABLE)
@@ -117,7 +93,7 @@ def test_worst_condition_that_the_limit_admits(views, solve):
     rhs = torch.randn(500, 10, generator=generator)
     problem = rows, weights, damping, rhs
     bound = 3 * torch.finfo(torch.float32).eps * views * ROW_LIMIT**2  # rounding times condition
-    assert scaled_error(solve(*problem), exact(*problem), damping, rhs) < bound
+    assert scaled_error(solve(*problem), solve_exactly(*problem), damping, rhs) < bound
     endless = solve(rows * 1e12, weights, damping, rhs)
     assert torch.isfinite(endless).all()
     assert (endless.norm(dim=-1) <= (1 + bound) * rhs.norm(dim=-1)).all()

@@ -170,7 +170,7 @@ def test_a_film(turbogs, finished, tmp_path, path):
     assert code == 0 and str(video) in out, err
     reader = ffmpeg.read_frames(str(video))
     facts = next(reader)
-    assert facts["fps"] == 60 and facts["size"] == ((32, 24) if path not in ("orbit", "views") else (48, 40))
+    assert facts["fps"] == 60 and facts["size"] == ((32, 24) if path not in ("orbit", "views") else (40, 24))
     frames = [np.frombuffer(frame, dtype=np.uint8) for frame in reader]
     assert len(frames) == 6
     if path == "views":

@@ -155,8 +155,8 @@ def masked_capture(tmp_path_factory):
     capture = tiny_capture(tmp_path_factory.mktemp("gpu-masks"))
     (capture / "masks").mkdir()
     for photo in (capture / "images").iterdir():
-        half = Image.new("L", (48, 40))
-        half.paste(255, (0, 0, 20, 40))
+        half = Image.new("L", (40, 24))
+        half.paste(255, (0, 0, 20, 24))
         half.save(capture / "masks" / f"{photo.stem}.png")
     return load_scene(capture)
 
@@ -186,6 +186,6 @@ def test_maps_and_photos_on_the_host_have_the_same_masks(masked_capture):
 
 
 def assert_unmasked_alone_is_learnt(trainer):
-    errors, stamps = (trainer.state_dict()["maps"][name].cpu().view(7, 40, 48) for name in ("errors", "stamps"))
+    errors, stamps = (trainer.state_dict()["maps"][name].cpu().view(7, 24, 40) for name in ("errors", "stamps"))
     assert not errors[:, :, 20:].any() and (stamps[:, :, 20:] == -1).all() and (stamps[:, :, :20] >= 0).any()
     assert all(value.isfinite().all() for _, value in trainer.gaussians.items())

@@ -48,7 +48,7 @@ def without_replaced(settings: Sequence[str], overrides: Sequence[str]) -> list[
 
 
 def tiny_capture(folder: Path) -> Path:
-    """8 photos of 48x40, of which 7 train, and some 70 points: every sixteenth of the demo capture's."""
+    """8 photos of 40x24, of which 7 train, and some 70 points: every sixteenth of the demo capture's."""
     return Path(shutil.copytree(_tiny_capture().name, folder / "capture"))
 
 
@@ -57,7 +57,7 @@ def _tiny_capture() -> TemporaryDirectory:
     """Made once in a process; gone with it."""
     folder = TemporaryDirectory(prefix="tiny-capture-")
     Path(folder.name).rmdir()
-    thin_out_points(write_demo_capture(Path(folder.name), views=8, width=48, height=40), 16)
+    thin_out_points(write_demo_capture(Path(folder.name), views=8, width=40, height=24), 16)
     return folder
 
 

@@ -98,6 +98,14 @@ def _rank(rank: int, count: int, port: int, function: Callable[..., object], fol
     error.flush()
 
 
+def command_line(words: list[str]) -> None:
+    """In a process of its own: the command."""
+    from turbogs_plugin import cli
+
+    sys.argv = ["turbogs", *words]
+    cli.main()
+
+
 def grouped() -> Any:
     """This process's `ProcessRanks`, of a gloo group."""
     from turbogs_plugin.distributed.ranks import ProcessRanks

@@ -128,14 +128,15 @@ def measure_case(case: StatisticsCase, device: torch.device) -> StatisticsErrors
     return compared(case.name, statistics_of(*inputs, exact=False), statistics_of(*inputs, exact=True))
 
 
-def measure_window(device: torch.device) -> StatisticsErrors:
-    """The sums of a long window: squares over eight decades, added one by one in float32."""
+def measure_window(device: torch.device, looks: int | None = None) -> StatisticsErrors:
+    """The sums of `looks` views (None: `LOOKS`): squares over eight decades, added one by one in float32."""
     generator = torch.Generator().manual_seed(6)
     level = 10 ** (8 * torch.rand(ROWS, generator=generator, dtype=torch.float64) - 18)
     given, exact = GaussianStats.zeros(ROWS, device), GaussianStats.zeros(ROWS, "cpu").map(Tensor.double)
-    for _ in range(LOOKS):
+    looks = looks or LOOKS
+    for _ in range(looks):
         look = (level * torch.rand(ROWS, generator=generator, dtype=torch.float64)).float()
         for name in SUMS:
             getattr(given, name).add_(look.to(device))
             getattr(exact, name).add_(look)
-    return compared(f"window of {LOOKS} looks", given, exact)
+    return compared(f"window of {looks} looks", given, exact)

@@ -40,10 +40,10 @@ def test_a_run_that_was_lost_and_resumed_has_every_point_once(capture, tmp_path,
     (name,) = events.Tags()["images"]
     images = events.Images(name)
     assert [image.step for image in images] == [0, 7, 14]
-    assert (images[0].height, images[0].width) == (40, 3 * 48 + 12)
+    assert (images[0].height, images[0].width) == (24, 3 * 40 + 12)
     first, last = (np.asarray(Image.open(io.BytesIO(images[at].encoded_image_string))) for at in (0, -1))
-    assert (first[:, :48] == last[:, :48]).all(), "the photo stays"
-    assert (first[:, 60:100] != last[:, 60:100]).any(), "the render changes"
+    assert (first[:, :40] == last[:, :40]).all(), "the photo stays"
+    assert (first[:, 50:80] != last[:, 50:80]).any(), "the render changes"
 
 
 def test_nothing_is_written_unless_asked_for(capture):

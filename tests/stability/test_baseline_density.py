@@ -178,7 +178,7 @@ def test_noise_follows_the_next_iterations_rate_of_the_means():
     assert lengths[2] / lengths[1] == pytest.approx(2.0, rel=1e-3)
 
 
-@settings(max_examples=120, deadline=None, derandomize=True)
+@settings(max_examples=70, deadline=None, derandomize=True)
 @given(
     name=st.sampled_from(sorted(MAKERS)),
     sums=st.lists(VALUES, min_size=len(fields(GaussianStats)), max_size=len(fields(GaussianStats))),

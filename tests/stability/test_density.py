@@ -36,7 +36,7 @@ def test_what_is_too_large_to_split_goes(split, log_scale):
     assert len(result) == (400 if log_scale == 40 else 200)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(
     sums=st.lists(VALUES, min_size=7, max_size=7),
     orders=st.sampled_from(ORDERS),

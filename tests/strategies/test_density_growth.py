@@ -63,9 +63,7 @@ def test_a_draw_takes_as_many_as_pass_the_gate_from_all_the_seen():
     stats.absgrad_sums[:] = 0
     stats.absgrad_sums[:8] = 1e3
     stats.square_sums[:20] = 0  # TINY: these come last
-    density = controlled(
-        gaussians, stats, choose_by="squares", **GROWS | {"absgrad_threshold": 1.0, "top_fraction": 0.1}
-    )
+    density = controlled(gaussians, stats, choose_by="squares", **GROWS | {"absgrad_threshold": 1, "top_fraction": 0.1})
     drawn = grown(density.update(gaussians, FULL))
     assert len(drawn) == int((stats.weight_sums[:8] > 0).sum()) > 0
     assert min(drawn) >= 20 and all(stats.weight_sums[row] > 0 for row in drawn)

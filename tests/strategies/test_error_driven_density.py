@@ -303,7 +303,7 @@ def test_resumed_is_bit_identical(cls):
     seen=st.sampled_from([0.0, 0.5, 1.0]),
     far=st.booleans(),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_the_cap_holds_at_the_end(cap, keep, every, choose_by, seen, far):
     """Whatever was seen, and whatever is spared: never more than the bound, and at the end never more than the cap."""
     settings_of = {"max_gaussians": cap, "final_keep": keep, "final_every": every, "choose_by": choose_by}

@@ -83,9 +83,9 @@ STAGED = [
 
 @pytest.mark.parametrize(("hard", "stable", "mixed", "stages"), STAGED)
 def test_pixel_frequencies_are_exact(hard, stable, mixed, stages):
-    """1,500 views of 3x2 pixels, 3 drawn of each."""
+    """800 views of 3x2 pixels, 3 drawn of each."""
     sampler = ErrorGuidedPixelSampler(hard_ratio=hard, stable_ratio=stable, mixed=mixed)
-    drawn = drawn_units(sampler, 3.5 / 256, 1500, (3, 2), ERRORS, AGES, torch.arange(6))
+    drawn = drawn_units(sampler, 3.5 / 256, 800, (3, 2), ERRORS, AGES, torch.arange(6))
     assert (drawn.sum(axis=1) == 3).all()
     assert_frequencies(drawn, exact_sets(ERRORS, AGES, stages, mixed == "uniform"))
 
@@ -96,7 +96,7 @@ def test_tiles_are_drawn_by_their_sums(hard, stable, mixed, stages):
     y, x = np.mgrid[0:32, 0:48]
     units = torch.as_tensor((y // 16 * 3 + x // 16).reshape(-1))
     sampler = ErrorGuidedPixelSampler(hard_ratio=hard, stable_ratio=stable, mixed=mixed, unit="tile")
-    drawn = drawn_units(sampler, 3 / 6, 600, (48, 32), ERRORS, AGES, units)
+    drawn = drawn_units(sampler, 3 / 6, 300, (48, 32), ERRORS, AGES, units)
     assert (drawn.sum(axis=1) == 3).all()
     assert_frequencies(drawn, exact_sets(ERRORS, AGES, stages, mixed == "uniform"))
 
@@ -113,7 +113,7 @@ def test_a_tile_with_one_bad_pixel_counts_its_sum_and_its_oldest():
 
 
 def test_random_pixels_are_uniform():
-    drawn = drawn_units(RandomPixelSampler(), 2.5 / 256, 3000, (3, 2), ERRORS, AGES, torch.arange(6))
+    drawn = drawn_units(RandomPixelSampler(), 2.5 / 256, 1500, (3, 2), ERRORS, AGES, torch.arange(6))
     assert_frequencies(drawn, exact_sets([1] * 6, [1] * 6, (0, 0, 2), True))
 
 
@@ -124,7 +124,7 @@ def test_random_pixels_are_uniform():
 def test_weights_make_sums_unbiased(stages, columns, wanted, tolerance):
     """Sums of 1 and of v over the drawn, divided by p, against the sums over all: exact for a single stage, and within
     2 % where three follow one another (they are combined as if independent)."""
-    rows = 20_000
+    rows = 8_000
     generator = torch.Generator().manual_seed(3)
     errors = torch.rand(columns, generator=generator, dtype=torch.float64).half().double()
     values = torch.rand(columns, generator=generator, dtype=torch.float64)

@@ -16,7 +16,6 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.grid import PACKAGE, Ablation, load_ablation, variant_config
 from turbogs_plugin.study.results import CellResult, Study, curve_and_final
 from turbogs_plugin.study.statistics import Difference, Spread, mean_curve, pareto_front, seconds_to_reach, summarise
-from turbogs_plugin.study.study_plots import draw_over_time
 from turbogs_plugin.study.study_report import report_text
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.yaml_json import packaged_names
@@ -62,10 +61,7 @@ def test_what_a_variant_does_not_name_is_as_in_the_base(name):
         assert changed <= DEFAULTS_THAT_DIFFER.get(variant, set()), variant
 
 
-DEFAULTS_THAT_DIFFER = {
-    "3dgs": {"optimizer.learning_rates.final_factor"},
-    "fastgs": {"density.refine_every"},
-}
+DEFAULTS_THAT_DIFFER = {"3dgs": {"optimizer.learning_rates.final_factor"}, "fastgs": {"density.refine_every"}}
 """A type's own values, where a variant is meant to have them."""
 
 
@@ -242,17 +238,3 @@ def test_a_capture_without_the_baseline_is_compared_with_nothing():
     fox, h = summarise(study)
     assert (fox.baseline, h.baseline) == ("base", "")
     assert "nan" not in report_text(study, [fox, h])
-
-
-def test_the_plot_of_a_study_has_all_its_captures():
-    cells = [
-        cell(name, seed, entry(0, 0.0, 20.0), entry(100, 10.0 + seed, 30.0), scene=scene)
-        for name in ("a", "b")
-        for seed in (0, 1)
-        for scene in ("fox", "h")
-    ]
-    figure = draw_over_time(summarise(Study(Ablation("x", {"a": [], "b": []}), cells)))
-    assert [axes.get_title() for axes in figure.axes] == ["fox", "fox", "h", "h"]
-    np.testing.assert_allclose(figure.axes[2].get_lines()[1].get_xdata(), [0.0, 10.5])
-    (legend,) = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["a", "b"], "each variant once"

@@ -212,9 +212,7 @@ def test_rows_that_are_not_finite_are_left_out_and_counted_once(finished, captur
     file = save_splats(tmp_path / "ckpt.pt", model)
     with pytest.warns(UserWarning) as warned:
         loaded = load_given(file, load_scene(capture))
-    assert [str(line.message) for line in warned] == [
-        f"{file}: 3 of {len(model)} Gaussians are not finite and left out"
-    ]
+    assert [str(w.message) for w in warned] == [f"{file}: 3 of {len(model)} Gaussians are not finite and left out"]
     assert_alike(loaded, load_model(finished, CPU).gaussians.map(lambda value: value[kept]))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from contextlib import ExitStack
 from types import SimpleNamespace
 
 import numpy as np
@@ -83,7 +84,8 @@ def training(iteration: int, gaussians: int) -> SimpleNamespace:
 
 
 def test_progress_is_a_line_an_evaluation_where_there_is_no_terminal(capsys):
-    with TrainingProgress() as progress:
+    with ExitStack() as shown:
+        progress = TrainingProgress(shown)
         progress.advanced(training(1, 5))
         progress.evaluated(training(10, 5), evaluation(10, skipped_updates=3))
     lines = capsys.readouterr().err.splitlines()
@@ -95,7 +97,8 @@ def test_progress_is_a_bar_on_a_terminal(capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setattr("turbogs_plugin.train.session.REFRESH_SECONDS", 0.0)
-    with TrainingProgress() as progress:
+    with ExitStack() as shown:
+        progress = TrainingProgress(shown)
         progress.evaluated(training(10, 5), evaluation(10))
         progress.advanced(training(50, 1234))
     shown = capsys.readouterr().err

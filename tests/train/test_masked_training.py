@@ -28,7 +28,7 @@ from turbogs_plugin.types import PARAMETER_NAMES, PixelSamples, Step
 pytestmark = pytest.mark.usefixtures("plotted")
 
 CPU = torch.device("cpu")
-SIZE = (48, 40)
+SIZE = (40, 24)
 
 
 def disc_mask(view: int) -> np.ndarray:
@@ -191,13 +191,13 @@ def test_what_shows_through_model_and_photos_is_the_same(scene):
     trainer = Trainer(tiny_config("capture", "train.background=random", "maps.beta=1").without_plan(), given, CPU)
     trainer.gaussians.opacities.fill_(-50.0)
     trainer.initialise_maps()
-    errors = trainer.maps.errors.view(7, 40, 48)
+    errors = trainer.maps.errors.view(7, 24, 40)
     assert (errors[:, :, 30:] == 0).all() and errors[:, :, :20].mean() > 0.1
     before = trainer.gaussians.map(torch.clone)
     assert trainer.background.at(trainer.now) != trainer.background.at(Step(1, 10, 5))
     trainer.step()
-    drawn = (trainer.maps.stamps == 0).view(7, 40, 48)
-    assert drawn[:, :, 30:].any() and (trainer.maps.errors.view(7, 40, 48)[:, :, 30:][drawn[:, :, 30:]] == 0).all()
+    drawn = (trainer.maps.stamps == 0).view(7, 24, 40)
+    assert drawn[:, :, 30:].any() and (trainer.maps.errors.view(7, 24, 40)[:, :, 30:][drawn[:, :, 30:]] == 0).all()
     assert torch.equal(before.opacities, trainer.gaussians.opacities)
 
 
@@ -210,13 +210,13 @@ def test_an_opaque_model_in_front_of_nothing_is_an_error_on_another_background(s
     trainer.gaussians.opacities.fill_(6.0)
     trainer.gaussians.scales += 3.0
     trainer.initialise_maps()
-    errors = trainer.maps.errors.view(7, 40, 48)[:, :, 30:]
+    errors = trainer.maps.errors.view(7, 24, 40)[:, :, 30:]
     assert (errors.max() > 0.3) == (setting != "black")
     shown = trainer.background.evaluated
     assert shown == {"random": (1, 1, 1), "white": (1, 1, 1), "black": (0, 0, 0)}.get(setting, (0.2, 0.4, 0.6))
     metrics = evaluate(trainer.gaussians, given.test, Look(0, trainer.config.raster, shown))
     image = render_image(trainer.gaussians, given.test.cameras, 0, sh_degree=0, background=shown).colors.clamp(0, 1)
-    pixels = given.test.photos.colors.view(40, 48, 4).float() / 255
+    pixels = given.test.photos.colors.view(24, 40, 4).float() / 255
     photo = pixels[..., :3] + (1 - pixels[..., 3:]) * torch.tensor([float(c) for c in shown])
     assert metrics.mean.l1 == pytest.approx(float((image - photo).abs().mean()), rel=1e-5)
 

@@ -2,12 +2,9 @@
 
 import json
 import math
-import multiprocessing
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +14,7 @@ import pycolmap
 import pytest
 import torch
 from helpers.framework_runs import assert_identical, stop_after, tiny_config, tiny_settings
-from helpers.processes import PRELOADED, ended
+from helpers.processes import ended, said, start_ranks
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
@@ -31,6 +28,7 @@ from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.inputs import open_scene
+from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import LossOutput, PixelSamples, RowUpdate
 from turbogs_plugin.yaml_json import parse_yaml
@@ -58,6 +56,9 @@ def test_a_run_leaves_everything_that_it_promises(whole, capture):
     assert history[-1]["psnr"] > history[0]["psnr"] + 1.0
     assert [line["train_seconds"] for line in history] == sorted(line["train_seconds"] for line in history)
     assert history[-1]["nonfinite_losses"] == history[-1]["skipped_updates"] == 0
+    test = load_scene(capture).test
+    measured = evaluate(whole.trainer.gaussians, test, whole.trainer.look(test.names))
+    assert history[-1]["psnr"] == pytest.approx(measured.mean.psnr) and len(measured.views) == 1
 
     page = folder.report.read_text()
     said = ("LPIPS was not computed", "FPS")
@@ -100,7 +101,7 @@ STOPS = {
 def test_a_run_stopped_again_and_again_is_the_same_bit_for_bit(capture, whole, tmp_path, monkeypatch):
     """At every stop, the first before the first iteration, and at its end."""
     config = tiny_config(capture).without_plan()
-    trainer = Trainer(config, open_scene(config), torch.device("cpu"))
+    trainer = Trainer(config, open_scene(config.scene, True), torch.device("cpu"))
     initialise, place = Trainer.initialise_maps, tmp_path / "run"
 
     def interrupted(trainer):
@@ -140,30 +141,26 @@ def killed_at_7(capture: Path, out: Path) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
 
     Trainer.step = killed
-    torch.set_num_threads(1)
     run.train(tiny_config(capture, "train.checkpoint_every=2"), out)
 
 
 def test_a_run_killed_without_notice_resumes_bit_for_bit(capture, whole, tmp_path):
     """Between two checkpoints. What a kill in the midst of one leaves behind: test_checkpoint.py."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(PRELOADED)
-    process = context.Process(target=killed_at_7, args=(capture, tmp_path / "run"))
-    process.start()
-    assert ended([process]) == [-signal.SIGKILL]
+    assert ended(start_ranks(1, killed_at_7, tmp_path, capture, tmp_path / "run")) == [-signal.SIGKILL]
     assert saved(tmp_path / "run")["iteration"] == 6
     run.resume(tmp_path / "run")
     assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
 
 
-def test_sigterm_before_training_ends_the_process_without_a_trace(capture):
+def terminated(capture: Path) -> None:
+    """In a process of its own, which has pycolmap: SIGTERM once a capture is read."""
+    load_scene(capture)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_sigterm_before_training_ends_the_process_without_a_trace(capture, tmp_path):
     """pycolmap brings a handler that prints one."""
-    code = (
-        "import os, signal, sys; from turbogs_plugin.captures import load_scene\n"
-        "load_scene(sys.argv[1]); os.kill(os.getpid(), signal.SIGTERM)"
-    )
-    done = subprocess.run([sys.executable, "-c", code, str(capture)], capture_output=True, text=True, timeout=120)
-    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, "", "")
+    assert ended(start_ranks(1, terminated, tmp_path, capture)) == [-signal.SIGTERM] and said(tmp_path) == ""
 
 
 def test_a_run_without_a_checkpoint_starts_again(capture, whole, tmp_path, monkeypatch):
@@ -295,7 +292,7 @@ class OwnSampler(PixelSampler):
     """A sampler that forgets which views it was asked for."""
 
     def sample(self, maps, view_ids, rate, step):
-        return PixelSamples.from_mask(torch.ones(len(view_ids), 40, 48, dtype=torch.bool))
+        return PixelSamples.from_mask(torch.ones(len(view_ids), 24, 40, dtype=torch.bool))
 
 
 class OwnLoss(SparseLoss):

@@ -56,7 +56,7 @@ def test_the_render_is_that_of_the_engine(state, view):
 @pytest.mark.parametrize("picture", list(Picture))
 @pytest.mark.parametrize("size", [(64, 48), (33, 97), (16, 16), (300, 20)])
 def test_every_picture_has_the_size_of_the_page(state, picture, size):
-    state.samples = PixelSamples.from_mask(torch.rand(40, 48, generator=torch.Generator().manual_seed(0)) < 0.1, [1])
+    state.samples = PixelSamples.from_mask(torch.rand(24, 40, generator=torch.Generator().manual_seed(0)) < 0.1, [1])
     found, _ = draw(state, picture, replace(FLAT, width=size[0], height=size[1]), 1)
     assert found.shape == (size[1], size[0], 3) and found.dtype == np.uint8
 
@@ -87,7 +87,7 @@ def test_the_error_map_is_bright_where_the_map_says_so(state):
 
 
 def test_the_age_map_is_black_where_pixels_were_just_sampled(state):
-    mask = torch.zeros(40, 48, dtype=torch.bool)
+    mask = torch.zeros(24, 40, dtype=torch.bool)
     mask[3:9, 20:30] = True
     samples, step = PixelSamples.from_mask(mask, [VIEW]), Step(50, 100, 50)
     maps, _ = state.maps
@@ -99,8 +99,8 @@ def test_the_age_map_is_black_where_pixels_were_just_sampled(state):
 
 
 def test_samples_are_shown_where_they_fall(state):
-    masks = torch.zeros(2, 40, 48, dtype=torch.bool)
-    masks[0, 0, 0] = masks[1, 12, 34] = masks[1, 39, 47] = True
+    masks = torch.zeros(2, 24, 40, dtype=torch.bool)
+    masks[0, 0, 0] = masks[1, 12, 34] = masks[1, 23, 39] = True
     state.samples = PixelSamples.from_mask(masks, [5, VIEW])
     found, _ = draw(state, Picture.SAMPLES, own_size(state), VIEW)
     assert np.array_equal((found == SAMPLED).all(axis=2), masks[1].numpy())

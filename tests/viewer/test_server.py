@@ -1,22 +1,22 @@
 """The page as a client without a browser meets it: frames, hostile input, ports, and the commands that open it."""
 
 import math
+import os
 import signal
 import socket
-import subprocess
 import sys
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import TINY, assert_identical
-from helpers.processes import comes_true
+from helpers.processes import comes_true, command_line, ended, said, start_ranks
 from helpers.viewer_client import ViewerClient
 
 from turbogs_plugin.model.formats import FORMATS
@@ -120,32 +120,28 @@ def test_without_viser_one_line_names_the_extra(turbogs, tmp_path, capture, monk
     assert not (tmp_path / "run").exists()
 
 
+def shown_until_ctrl_c(words: list[str], told: Path) -> None:
+    """In a process of its own: the command. A shell starts what it puts into the background with SIGINT ignored, and
+    children inherit that."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with told.open("w", buffering=1) as sys.stdout:
+        command_line(words)
+
+
 def test_a_command_with_a_viewer_shows_the_model_until_ctrl_c(capture, tmp_path):
-    out = tmp_path / "run"
+    out, told = tmp_path / "run", tmp_path / "told"
     changes = [*TINY, "train.iterations=2", "train.refine_until=1", "train.evaluate_at=[]"]
-    command = ["train", capture, *changes, "--out", out, "--no-report", "--device", "cpu", "--viewer", "0"]
-    # A shell starts what it puts into the background with SIGINT ignored, and children inherit that.
-    heeding = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    process = subprocess.Popen(
-        [sys.executable, "-c", heeding + "from turbogs_plugin.cli import main; sys.exit(main())", *map(str, command)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    told = []
-    reader = threading.Thread(target=lambda: told.extend(process.stdout), daemon=True)
-    reader.start()
+    words = ["train", str(capture), *changes, "--out", str(out), "--no-report", "--device", "cpu", "--viewer", "0"]
+    (process,) = processes = start_ranks(1, shown_until_ctrl_c, tmp_path, words, told)
     try:
-        assert comes_true(lambda: "Ctrl-C ends" in "".join(told) or process.poll() is not None, 120.0)
-        assert (out / "model.ply").is_file(), process.poll()
-        process.send_signal(signal.SIGINT)
-        code = process.wait(60.0)
+        shown = lambda: told.is_file() and "Ctrl-C ends" in told.read_text()  # noqa: E731
+        assert comes_true(lambda: shown() or not process.is_alive(), 120.0)
+        assert (out / "model.ply").is_file(), process.exitcode
+        os.kill(process.pid, signal.SIGINT)
     finally:
-        process.kill()
-        reader.join(60.0)
-    err = process.stderr.read()
-    assert code == 0 and told[-1].endswith("(Ctrl-C ends)\n"), err
-    assert "viewer  http://localhost:" in err and "Traceback" not in err and "viser" not in "".join(told) + err
+        codes, err = ended(processes, 60.0), said(tmp_path)
+    assert codes == [0] and told.read_text().endswith("(Ctrl-C ends)\n"), err
+    assert "viewer  http://localhost:" in err and "Traceback" not in err and "viser" not in told.read_text() + err
 
 
 def test_bad_input_is_one_line(turbogs, tmp_path, capture):

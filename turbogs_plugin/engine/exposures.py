@@ -17,8 +17,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from turbogs_plugin.device import on_device
 from turbogs_plugin.engine.moments import check_state
-from turbogs_plugin.types import PixelSamples, Step, on_device
+from turbogs_plugin.types import PixelSamples, Step
 
 FIRST_RATE, LAST_RATE = 3e-3, 3e-4
 """Adam's rates at the start and the end of a run, a third of 3DGS's for exposures. Not yet measured."""

@@ -63,7 +63,7 @@ class Decision:
     """One line of a plan.
 
     Args:
-        setting: ``section.key``.
+        setting: name of a field of the section `train`.
         value: in the run.
         made: ``auto`` by the facts, or ``set`` by the configuration.
         reason: by the facts; for what is set, with the value that they would have led to.
@@ -76,8 +76,8 @@ class Decision:
 
 
 def decide(setting: str, facts: SceneFacts, config: Config) -> Decision:
-    """A setting's value in a run: by the configuration or, where that is ``auto``, by the facts."""
-    present, (value, reason) = getattr(config.train, setting.removeprefix("train.")), RULES[setting](facts, config)
+    """The value of `train.<setting>` in a run: by the configuration or, where that is ``auto``, by the facts."""
+    present, (value, reason) = getattr(config.train, setting), RULES[setting](facts, config)
     if present == AUTO:
         return Decision(setting, value, "auto", reason)
     return Decision(setting, present, "set", f"auto: {yaml_text(value)}, {reason}")
@@ -191,15 +191,15 @@ def _sign(reached: bool) -> str:
 
 
 RULES: dict[str, Callable[[SceneFacts, Config], Verdict]] = {
-    "train.backdrop": wanted_backdrop,
-    "train.background": wanted_background,
-    "train.exposure": wanted_exposure,
-    "train.dropout": wanted_dropout,
-    "train.batch_for": wanted_batch_for,
-    "train.iterations": wanted_iterations,
-    "train.pixels_place": wanted_pixels_place,
+    "backdrop": wanted_backdrop,
+    "background": wanted_background,
+    "exposure": wanted_exposure,
+    "dropout": wanted_dropout,
+    "batch_for": wanted_batch_for,
+    "iterations": wanted_iterations,
+    "pixels_place": wanted_pixels_place,
 }
-"""Setting that may be ``auto`` (`AUTO_SETTINGS`) -> its rule."""
+"""Setting of the section `train` that may be ``auto`` (`AUTO_SETTINGS`) -> its rule."""
 
 
 @dataclass(frozen=True)
@@ -212,19 +212,19 @@ class Plan:
     def apply(self, config: Config) -> Config:
         """The configuration with everything decided: a plan of it changes nothing."""
         made = {decision.setting: decision.value for decision in self.decisions if decision.made == "auto"}
-        if (batch := made.pop("train.batch_for", None)) is not None:
+        if (batch := made.pop("batch_for", None)) is not None:
             config = with_batch_for(config, int(batch))
-        if (iterations := made.pop("train.iterations", None)) is not None:
+        if (iterations := made.pop("iterations", None)) is not None:
             config = with_iterations(config, int(iterations))
-        return config.changed(train={name.removeprefix("train."): value for name, value in made.items()})
+        return config.changed(train=made)
 
     def text(self) -> str:
         """For a terminal, and ``plan.txt`` of a run: a line a decision."""
         name = max(len(decision.setting) for decision in self.decisions)
         value = max(len(yaml_text(decision.value)) for decision in self.decisions)
         lines = [
-            f"  {decision.setting:<{name}} {yaml_text(decision.value):<{value}}  {decision.made:<4}  {decision.reason}"
-            for decision in self.decisions
+            f"  train.{each.setting:<{name}} {yaml_text(each.value):<{value}}  {each.made:<4}  {each.reason}"
+            for each in self.decisions
         ]
         return "\n".join([f"plan for {self.facts.train_views} training views", *lines])
 

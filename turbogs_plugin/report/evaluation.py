@@ -77,7 +77,11 @@ def load_lpips(device: torch.device) -> tuple[ImageError | None, str]:
         return None, f"it needs {' and '.join(missing)}: pip install {' '.join(missing)} torch=={release}"
     weights = Path(torch.hub.get_dir()) / "checkpoints" / "vgg16-397923af.pth"  # torchvision's name
     if not weights.is_file():
-        return None, f"there are no weights of VGG16 on this machine: put torchvision's file at {weights}"
+        # Without the folder's path: studies keep the reason in their records, which others read.
+        return (
+            None,
+            f"there are no weights of VGG16 here: put torchvision's {weights.name} into torch's hub/checkpoints",
+        )
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to(device)

@@ -17,23 +17,22 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import astuple, dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from turbogs_plugin.captures.camera_refinement import refine_cameras
-from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.config.sections import SceneConfig
 from turbogs_plugin.device import free_device_memory, processor_cores
 from turbogs_plugin.distributed.processes import end_with_parent
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import Provenance, provenance
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.agreement import require_agreement
 from turbogs_plugin.study.cell import capture_digest, train_cell
 from turbogs_plugin.study.grid import Ablation, CellKey, variant_config
 from turbogs_plugin.study.results import Study, StudyFolder, changes, flat_settings
 from turbogs_plugin.study.study_report import write_report
-from turbogs_plugin.train.inputs import resolve_device
+from turbogs_plugin.train.inputs import open_scene, resolve_device
 
 OF_A_CALL = ("train.device", "train.batch_for", "report.")
 """Beginnings of settings that may differ between a kept cell and a later call: they change no result."""
@@ -130,7 +129,7 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
             kept = {result.key: result for result in folder.read_study().results}
             if not mine or key in kept:
                 continue
-            scene, digest, loading = _loaded(*astuple(config.scene), config.train.refine_cameras)
+            scene, digest, loading = _loaded(astuple(config.scene), config.train.refine_cameras)
             if any(cell.scene == key.scene and cell.capture not in ("", digest) for cell in kept.values()):
                 raise InputError(f"'{key.scene}' has other photos than its kept cells: choose a new --out")
             try:
@@ -150,13 +149,11 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
 
 
 @lru_cache(maxsize=2)  # with refined cameras and without
-def _loaded(path: str, factor: int, test_every: int, force: bool, refined: bool) -> tuple[Scene, str, float]:
+def _loaded(settings: tuple[Any, ...], refine: bool) -> tuple[Scene, str, float]:
     """Capture, its digest, and the seconds in which it was loaded. It stays for the next cells."""
     started = time.perf_counter()
-    scene = load_scene(path, factor, test_every)
-    if not force:
-        require_agreement(scene)
-    return refine_cameras(scene, refined), capture_digest(scene), time.perf_counter() - started
+    scene = open_scene(SceneConfig(*settings), refine)
+    return scene, capture_digest(scene), time.perf_counter() - started
 
 
 def _require_same_settings(study: Study, configs: dict[CellKey, Config]) -> None:

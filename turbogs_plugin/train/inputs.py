@@ -10,6 +10,7 @@ import torch
 from turbogs_plugin.captures.camera_refinement import find_cameras, with_cameras
 from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.config.sections import SceneConfig
 from turbogs_plugin.device import synchronize
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine import library
@@ -32,6 +33,12 @@ def resolve_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+def require_device(name: str) -> None:
+    """`resolve_device`, for its error alone: by the driver's list, as CUDA itself starts while photos are decoded."""
+    if name == "cuda" and torch.cuda.device_count() == 0:
+        resolve_device(name)
+
+
 def show_loading(loaded: int, total: int) -> None:
     """Count decoded photos in a terminal line, which goes when all are there; nothing where stderr is no terminal."""
     if sys.stderr.isatty():
@@ -39,32 +46,35 @@ def show_loading(loaded: int, total: int) -> None:
         print(text, end="", file=sys.stderr, flush=True)
 
 
-def open_scene(config: Config, ranks: Ranks = ONE) -> Scene:
-    """The capture of a configuration. On a terminal, its photos are counted while they are decoded.
+def open_scene(settings: SceneConfig, refine: bool, ranks: Ranks = ONE, trained: bool = False) -> Scene:
+    """A capture. On a terminal, its photos are counted while they are decoded.
 
     Args:
+        refine: `train.refine_cameras`.
         ranks: the processes that train together; each calls this. The first one refines cameras for all: machines
             differ in their last digits, and replicas may not.
+        trained: a run has begun on it, so it is not asked again whether training on it can work.
 
     Raises:
         InputError: there is no usable capture, or no training on it can work.
     """
-    settings = config.scene
     scene = load_scene(settings.path, settings.factor, settings.test_every, show_loading if ranks.first else None)
-    if not settings.force:
+    if not (settings.force or trained):
         require_agreement(scene)
-    cameras = find_cameras(scene, config.train.refine_cameras) if ranks.first else None
+    cameras = find_cameras(scene, refine) if ranks.first else None
     return with_cameras(scene, ranks.agree(cameras))
 
 
-def open_started(config: Config, clock: WallClock, ranks: Ranks = ONE) -> tuple[Scene, torch.device]:
+def open_started(
+    config: Config, clock: WallClock, ranks: Ranks = ONE, trained: bool = False
+) -> tuple[Scene, torch.device]:
     """The capture, and the device with its kernels loaded: a thread starts it, in a second or more, while photos are
     decoded.
 
     Args:
         clock: of the wall, on which `PHOTOS` and `DEVICE` are marked.
-        ranks: as for `open_scene`. Where one process ends before, the others wait until their launcher ends
-            them.
+        ranks, trained: as for `open_scene`. Where one process ends before, the others wait until their launcher
+            ends them.
 
     Raises:
         InputError: there is no usable capture, or no such device.
@@ -80,7 +90,7 @@ def open_started(config: Config, clock: WallClock, ranks: Ranks = ONE) -> tuple[
 
     with ThreadPoolExecutor(1) as pool:
         started = pool.submit(start)
-        scene = open_scene(config, ranks)
+        scene = open_scene(config.scene, config.train.refine_cameras, ranks, trained)
         clock.mark(PHOTOS)
         device = started.result()
     clock.mark(DEVICE)

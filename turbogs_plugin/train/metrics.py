@@ -224,14 +224,12 @@ class Evaluations(Listener):
         evaluation = Evaluation(
             iteration=trainer.iteration,
             train_seconds=loop.clock.seconds,
-            psnr=mean.psnr,
-            ssim=mean.ssim,
-            l1=mean.l1,
             num_gaussians=len(trainer.gaussians),
             memory_bytes=peak_memory_bytes(trainer.device),
             nonfinite_losses=int(trainer.nonfinite_losses),
             skipped_updates=int(trainer.optimizer.skipped),
             worst_psnr=metrics.worst_psnr,
+            **{measure: getattr(mean, measure) for measure in MEASURES},
             **mean.further(),
         )
         self.history.append(evaluation)

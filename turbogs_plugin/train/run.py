@@ -23,7 +23,7 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.clock import WallClock
 from turbogs_plugin.train.history import rewind_history
-from turbogs_plugin.train.inputs import open_scene, open_started, resolve_device
+from turbogs_plugin.train.inputs import open_scene, open_started, require_device, resolve_device
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.pace import Pace, fitted_to_time
 from turbogs_plugin.train.run_files import RunFolder
@@ -46,7 +46,7 @@ def plan_run(config: Config, processes: int = 1) -> Plan:
         InputError: as `train`.
     """
     device = resolve_device(config.train.device)
-    scene = open_scene(config)
+    scene = open_scene(config.scene, config.train.refine_cameras)
     plan = make_plan(config, scene, device, processes)
     print("\n".join(scene.notes), file=sys.stderr)  # last, as an error is one line alone
     return plan
@@ -93,7 +93,7 @@ def fit(scene: Scene | Path | str, *overrides: str, config: str = DEFAULT_CONFIG
     settings = load_config(config, overrides)
     device = resolve_device(settings.train.device)
     if isinstance(scene, str | Path):
-        scene = open_scene(replace(settings, scene=replace(settings.scene, path=str(scene))))
+        scene = open_scene(replace(settings.scene, path=str(scene)), settings.train.refine_cameras)
     else:
         scene = refine_cameras(scene, settings.train.refine_cameras)
     loop = new_loop(make_plan(settings, scene, device).apply(settings), scene, device)
@@ -125,6 +125,7 @@ def train(
     clock = clock or WallClock()
     clock.mark(IMPORTS)
     folder = RunFolder(out)
+    require_device(config.train.device)
     if ranks.first:
         folder.require_new()
     if config.train.starts_from_model:
@@ -170,12 +171,13 @@ def resume(
     clock.mark(IMPORTS)
     folder = RunFolder(path)
     config = folder.read_config()
+    require_device(config.train.device)
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None and folder.model.is_file():
         raise InputError(f"'{path}' is finished and has no checkpoint to go on from: use its {folder.model.name}")
     state = None if checkpoint is None else load_checkpoint(checkpoint)
     require_writable(folder.path, f"what --resume {folder.path} writes")
-    scene, device = open_started(config, clock, ranks)
+    scene, device = open_started(config, clock, ranks, trained=True)
     hold_to_limit(config, device)
     with _fitting(scene):
         trainer = Trainer(config, scene, device, state is not None, ranks.engine(device))

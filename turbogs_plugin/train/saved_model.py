@@ -129,12 +129,12 @@ def load_with_capture(
     """
     if given is not None:
         require_model(path)  # before its capture is read
-        scene = open_scene(given)
+        scene = open_scene(given.scene, given.train.refine_cameras)
         gaussians = load_given(path, scene, given.train.init_world).map(lambda value: value.to(device))
         return SavedModel(None, given, gaussians, scene.frame, None, None, is_antialiased(path)), scene, ""
     model = load_model(path, device)
     try:
-        return model, open_scene(model.config), ""
+        return model, open_scene(model.config.scene, model.config.train.refine_cameras, trained=True), ""
     except InputError as error:
         if needed:
             raise

@@ -91,7 +91,7 @@ class RunSession(Listener):
             with interruptible(self._stop), ExitStack() as shown:
                 loop.listeners = [self]  # first, so that its marks tell apart what the others do
                 if ranks.first:
-                    progress = shown.enter_context(TrainingProgress())
+                    progress = TrainingProgress(shown)
                     loop.listeners += [self.evaluations, progress, *(listener_of(self) for listener_of in watch)]
                 loop.run(self.resumed)
                 self.clock.mark("training")
@@ -188,10 +188,13 @@ class RunSession(Listener):
 class TrainingProgress(Listener):
     """Shows iteration, time left, iterations a second, test PSNR and number of Gaussians.
 
-    rich is imported for a terminal alone. A context: the bar is shown while it is entered.
+    rich is imported for a terminal alone.
+
+    Args:
+        shown: the bar is there until this is left.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, shown: ExitStack) -> None:
         self._next_refresh = 0.0
         self._psnr = self._warning = ""
         self._bar: Progress | None = None
@@ -201,17 +204,8 @@ class TrainingProgress(Listener):
 
             said = TextColumn("{task.description}")
             columns = (MofNCompleteColumn(), BarColumn(None), TimeRemainingColumn(), said)
-            self._bar = Progress(*columns, console=Console(stderr=True), auto_refresh=False, expand=True)
-            self._task = self._bar.add_task("", total=None)
-
-    def __enter__(self) -> TrainingProgress:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+            bar = Progress(*columns, console=Console(stderr=True), auto_refresh=False, expand=True)
+            self._bar, self._task = shown.enter_context(bar), bar.add_task("", total=None)
 
     def advanced(self, loop: TrainingLoop) -> None:
         if self._bar is None or time.perf_counter() < self._next_refresh:

@@ -45,12 +45,7 @@ class Trainer(TrainingState):
     """
 
     def __init__(
-        self,
-        config: Config,
-        scene: Scene,
-        device: torch.device,
-        resuming: bool = False,
-        engine: Engine | None = None,
+        self, config: Config, scene: Scene, device: torch.device, resuming: bool = False, engine: Engine | None = None
     ) -> None:
         config.require_decided()
         engine = engine_of(device, for_training=True) if engine is None else engine

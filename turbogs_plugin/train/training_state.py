@@ -128,14 +128,8 @@ class TrainingState:
         """[H * W] the errors of a dense render of one view; 0 at masked pixels."""
         background, masks = self.background.at(self.now), self.maps.masks
         samples = dense_samples(self.views.cameras, [view_id]) if masks is None else masks.pixels([view_id])
-        rendered = rasterize(
-            self.gaussians,
-            self.views.cameras.select([view_id]),
-            samples,
-            sh_degree=self.sh_degree,
-            settings=self.config.raster,
-            background=background,
-        )
+        options = {"sh_degree": self.sh_degree, "settings": self.config.raster, "background": background}
+        rendered = rasterize(self.gaussians, self.views.cameras.select([view_id]), samples, **options)
         truth = self.views.photos.at(samples, background).colors()  # [P, 3]
         errors = truth.new_zeros(int(self.maps.sizes[view_id].prod()))
         errors[samples.pixel_ids.long()] = (self.shown(rendered.colors, samples) - truth).abs().sum(dim=-1)
@@ -304,9 +298,8 @@ def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
 
 def _mean_color(views: PosedImages) -> Tensor:
     """[3] float32, 0 .. 1: the mean of every `COLOR_STRIDE`-th pixel that is not masked; transparent ones on black."""
-    pixels = views.photos.stored[::COLOR_STRIDE, :3].float().cpu()
-    if views.masks is not None:
-        keep = [views.masks.image(view).reshape(-1) for view in range(len(views))]
-        kept = torch.cat(keep)[::COLOR_STRIDE]
+    pixels, masks = views.photos.stored[::COLOR_STRIDE, :3].float().cpu(), views.masks
+    if masks is not None:
+        kept = torch.cat([masks.image(view).reshape(-1) for view in range(len(views))])[::COLOR_STRIDE]
         pixels = pixels[kept] if kept.any() else pixels
     return pixels.mean(dim=0) / 255.0

@@ -7,7 +7,8 @@ Every shape is written with these letters:
 - ``P`` sample slots, ordered by (view of the batch, tile), ``T`` tiles that hold samples;
 - ``X`` pixels of all training views laid end to end ("flat pixels").
 
-`turbogs_plugin.types` imports nothing of the project but its exception, so strategies and framework can both import it.
+`turbogs_plugin.types` imports nothing of the project but `errors` and `device`, so strategies and framework can both
+import it.
 """
 
 from turbogs_plugin.types.cameras import BLACK, WHITE, Cameras, Color
@@ -19,26 +20,5 @@ from turbogs_plugin.types.gaussians import (
     GaussianStats,
     RowUpdate,
 )
-from turbogs_plugin.types.samples import TILE_SIZE, LossOutput, PixelSamples, TileGrid, on_device, sample_order
+from turbogs_plugin.types.samples import TILE_SIZE, LossOutput, PixelSamples, TileGrid, sample_order
 from turbogs_plugin.types.step import SamplingBudget, Step
-
-__all__ = [
-    "BLACK",
-    "PARAMETER_NAMES",
-    "SH_C0",
-    "TILE_SIZE",
-    "WHITE",
-    "Cameras",
-    "Color",
-    "GaussianGradients",
-    "GaussianStats",
-    "Gaussians",
-    "LossOutput",
-    "PixelSamples",
-    "RowUpdate",
-    "SamplingBudget",
-    "Step",
-    "TileGrid",
-    "on_device",
-    "sample_order",
-]

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.device import on_device
 from turbogs_plugin.errors import InputError
 
 TILE_SIZE = 16
@@ -37,12 +38,6 @@ def _starts(sizes: bytes, origin: tuple[int, int]) -> tuple[int, ...]:
     """`TileGrid.starts` of these int64 sizes. The result is kept, as iterations ask for few sizes again and again."""
     grid = TileGrid(np.frombuffer(sizes, dtype=np.int64).reshape(-1, 2), origin)
     return 0, *grid.shapes.prod(axis=1).cumsum().tolist()
-
-
-def on_device(numbers: Sequence[int] | np.ndarray, device: torch.device) -> Tensor:
-    """Numbers of the host as a tensor on a device, sent to a GPU without waiting for it."""
-    tensor = torch.as_tensor(numbers)
-    return tensor if device.type == "cpu" else tensor.pin_memory().to(device, non_blocking=True)
 
 
 @dataclass
@@ -166,17 +161,10 @@ class PixelSamples:
             tile_ids = self.tile_ids[tiles.start - first : tiles.stop - first]
         else:
             tile_ids = self.tile_ids[tiles] - first
-        return PixelSamples(
-            self.view_ids[views],
-            self.sizes[views],
-            self.pixel_ids[slots],
-            tile_ids,
-            tile_offsets - slots.start if slots.start else tile_offsets,
-            None if self.weights is None else self.weights[slots],
-            self.has_empty_slots,
-            host_ends=None,
-            origin=self.origin,
-        )
+        tile_offsets = tile_offsets - slots.start if slots.start else tile_offsets
+        weights = None if self.weights is None else self.weights[slots]
+        parts = self.pixel_ids[slots], tile_ids, tile_offsets, weights, self.has_empty_slots
+        return PixelSamples(self.view_ids[views], self.sizes[views], *parts, origin=self.origin)
 
     @property
     def filled(self) -> Tensor:
