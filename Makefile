@@ -24,7 +24,7 @@ demo/capture: | $(INSTALLED)
 	$(BIN)/turbogs demo $@
 
 # What README and docs/lab show of TurboGS, measured anew on a GPU machine, into results/COMMIT and docs/lab:
-# make results SCENES="PATH/fox PATH/caliterra PATH/snowmiku". The same call goes on after a stop.
+# make results SCENES="PATH/fox PATH/caliterra PATH/snowmiku PATH/bonsai PATH/train". The same call goes on after a stop.
 results: $(INSTALLED)
 	PATH="$(CURDIR)/$(BIN):$$PATH" docs/lab/measure.sh results $(SCENES)
 	$(MAKE) pages

@@ -1,5 +1,6 @@
 """README and docs/: links, files, commands and options that they name are there; their tables are made of files."""
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -55,10 +56,41 @@ def test_commands_and_options_that_pages_name_are_there():
     assert wrong == []
 
 
+BY_HAND = {"architecture.md", "captures.md", "guards.md", "numerics.md", "plan.md", "tried.md"}
+"""Pages with tables that say when and how each number was measured, or that number sections."""
+
+
+@pytest.mark.parametrize("planted", ["", "| mine | 31.46 |\n"])
+def test_numbers_in_tables_are_of_files(planted):
+    """Outside the blocks that are made of records, a table, and README's text, names settings' numbers alone."""
+    files = [*(ROOT / "configs").rglob("*.yaml"), ROOT / "docs" / "lab" / "rows.yaml"]
+    texts = [path.read_text() for path in files]
+    texts += [str(json.loads(path.read_text())["variants"]) for path in ROOT.glob("docs/lab/*/results.json")]
+    known = set(map(float, re.findall(r"[\d.]*\d(?:e-?\d+)?", " ".join(texts))))
+    wrong = []
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8") + planted
+        text = re.sub(r"<!-- made: .*?<!-- end -->|^```.*?^```|`[^`\n]*`", "", text, flags=re.DOTALL | re.MULTILINE)
+        lines = [line for line in text.splitlines() if page.name not in BY_HAND and line.startswith("|")]
+        said = re.findall(
+            r"(?<!Python |ction )(?<![\w.])\d*\.\d+(?![\w.])", "\n".join(lines) + text * (page == PAGES[0])
+        )
+        wrong += [f"{page.name}: {number}" for number in said if float(number) not in known]
+    assert bool(wrong) == bool(planted), wrong
+
+
+def test_nothing_advises_to_install_a_strangers_package():
+    """This package is on no index: its name alone would bring whatever somebody else puts there."""
+    files = [path for of in ("turbogs_plugin", "examples", "docs", ".ci") for path in (ROOT / of).rglob("*")]
+    files = [path for path in (*files, *PAGES) if path.suffix in (".py", ".md", ".sh")]
+    advice = re.compile(r"pip install (-\S+ )*[\"']?turbogs[-_]plugin")
+    assert [path.name for path in files if advice.search(path.read_text(encoding="utf-8"))] == []
+
+
 def test_make_pages_would_change_nothing(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs" / "lab"))
     import make_pages
 
     assert [page.name for page in PAGES if make_pages.filled(page.read_text()) != page.read_text()] == []
-    for name in ("make_pages", "paper_tables", "studies", "timings"):
+    for name in ("make_pages", "paper_tables", "record", "studies", "timings"):
         sys.modules.pop(name, None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shlex
 import shutil
 from importlib.metadata import PackageNotFoundError, version
 
@@ -27,7 +28,7 @@ REQUIREMENTS = (
 COMMAND_PACKAGES = {requirement.partition(">=")[0]: requirement for requirement in REQUIREMENTS}
 """Module -> requirement."""
 
-INSTALL_COMMANDS = 'pip install "turbogs-plugin[train]"'
+INSTALL_COMMANDS = f"pip install {shlex.join(REQUIREMENTS)}"
 
 
 def diagnosis() -> str:

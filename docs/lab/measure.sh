@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Measures what README and docs/lab show of TurboGS, on a machine with a GPU; `make results` calls it:
 #
-#     docs/lab/measure.sh OUT FOX CALITERRA SNOWMIKU
+#     docs/lab/measure.sh OUT FOX CALITERRA SNOWMIKU BONSAI TRAIN
 #
 # The captures are folders of these names. Results lie in OUT/COMMIT; what is there is not measured again, so the same
 # call goes on after a stop (Ctrl-C, or `timeout --signal INT 9m`). When all is there, it is copied into docs/lab.
@@ -13,13 +13,15 @@ if [ -z "${TURBOGS_COMMIT:-}" ] && [ -n "$(git status --porcelain --untracked-fi
 fi
 out=$1/${TURBOGS_COMMIT:-$(git rev-parse --short HEAD)}
 shift
-scenes=()
-for capture in "$@"; do scenes+=(--scene "$capture"); done
 gpus=$(nvidia-smi --list-gpus | wc -l)
 mkdir -p "$out"
 
-ablate() { # NAME SEED ...
-    turbogs ablate "$1" "${scenes[@]}" --gpus "$gpus" --out "$out/$1" --seeds "${@:2}"
+ablate() { # NAME SEEDS CAPTURE ... [--only VARIANT ...]
+    local study=$1 seeds=$2 scenes=()
+    shift 2
+    while [ $# -gt 0 ] && [ "$1" != --only ]; do scenes+=(--scene "$1") && shift; done
+    # shellcheck disable=SC2086 # seeds are words
+    turbogs ablate "$study" "${scenes[@]}" "$@" --gpus "$gpus" --out "$out/$study" --seeds $seeds
 }
 
 wall() { # VARIANT CAPTURE REPEATS SETTING ...
@@ -27,20 +29,28 @@ wall() { # VARIANT CAPTURE REPEATS SETTING ...
     [ -e "$file" ] || turbogs bench wall "${@:4}" --scene "$2" --repeats "$3" --out "$file"
 }
 
-studies="sizes paper parts departures density_departures bounds cameras paper_parts"
-for study in $studies; do ablate "$study" 0 1 2 3 4; done
-ablate baselines 0
+declare -A caps=([fox]=67 [caliterra]=157 [snowmiku]=57 [bonsai]=161 [train]=203) # thousands, FastGS's numbers
+for capture in "$@"; do
+    ablate record "0 1 2" "$capture" --only no-exposures ssim "cap-${caps[$(basename "$capture")]}k"
+done
 structure=(density.absgrad_threshold=4.5e-4 pixel_sampler.unit=tile loss.type=sparse_ssim loss.ssim_weight=0.4)
 for capture in "$@"; do
     wall turbogs "$capture" 3
+    wall no-exposures "$capture" 1 train.exposure=false
     wall ssim "$capture" 1 "${structure[@]}" train.dropout=auto # configs/turbogs-ssim.yaml
+    cap=${caps[$(basename "$capture")]}
+    wall "cap-${cap}k" "$capture" 1 train.exposure=false "density.max_gaussians=${cap}000"
 done
-wall cap-67k "$1" 1 density.max_gaussians=67000
-wall cap-94k "$1" 1 density.max_gaussians=94000
-wall cap-157k "$2" 1 density.max_gaussians=157000
-wall cap-57k "$3" 1 density.max_gaussians=57000
+# STUDIES="" measures the record alone.
+for study in ${STUDIES-paper parts departures density_departures bounds cameras paper_parts}; do
+    ablate "$study" "0 1 2 3 4" "${@:1:3}"
+done
+[ -z "${STUDIES-all}" ] || ablate baselines 0 "${@:1:3}"
 
-for study in $studies baselines; do cp "$out/$study/results.json" "docs/lab/$study/"; done
+for file in "$out"/*/results.json; do
+    study=docs/lab/$(basename "$(dirname "$file")")
+    mkdir -p "$study" && cp "$file" "$study/"
+done
 python - "$out" <<'PYTHON'
 """Joins the walls: variant -> capture -> what `turbogs bench wall` wrote."""
 import json, pathlib, sys

@@ -1,4 +1,4 @@
-"""Tables made of trainings: docs/lab/STUDY/results.json, and docs/lab/peers.json of other programs."""
+"""Tables made of trainings: docs/lab/STUDY/results.json."""
 
 from __future__ import annotations
 
@@ -9,43 +9,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
 LAB = Path(__file__).resolve().parent
 CAPTURES = ("fox", "caliterra", "snowmiku")
 ROWS = yaml.safe_load((LAB / "rows.yaml").read_text(encoding="utf-8"))
-"""What the rows of README's table and of docs/paper.md are."""
+"""What the rows of the record's tables and of docs/paper.md are."""
 STUDIES = tuple(sorted(file.parent.name for file in LAB.glob("*/results.json")))
 Cell = dict[str, Any]
 """One training, as `turbogs_plugin/study/results.py` describes its entry in results.json."""
 Cells = list[Cell]
 """Trainings of one variant on one capture, a seed each."""
-
-
-class Row(NamedTuple):
-    """A row of the headline table that is ours.
-
-    Args:
-        study, variant: where it is measured.
-        name: as the table has it.
-        capture: the only capture that the table shows it of; "": all three.
-    """
-
-    study: str
-    variant: str
-    name: str
-    capture: str = ""
-
-    def cells(self) -> dict[str, Cells]:
-        """Capture -> trainings."""
-        found = study_cells(self.study)
-        captures = [self.capture] if self.capture else CAPTURES
-        return {of: found[of][self.variant] for of in captures if self.variant in found.get(of, {})}
-
-
-OURS = [Row(**row) for row in ROWS["headline"]]
 
 
 @cache
@@ -152,51 +128,6 @@ def psnr_text(cells: Cells, measure: str = "psnr") -> str:
     return f"{mean(cells, measure):.2f}{spread}"
 
 
-def wall_seconds(row: Row, capture: str) -> float:
-    """Seconds of the whole command: the median run of `turbogs bench wall`; NaN where it was not measured."""
-    report = read_json("wall.json").get(row.variant, {}).get(capture) if row.study == "sizes" else None
-    return report["median"]["seconds"] if report else math.nan
-
-
-def peer_walls(entry: Mapping[str, Any]) -> list[float]:
-    """Seconds of another program's whole command, lowest and highest; empty where they were not measured."""
-    beyond = read_json("peers.json")["beyond_training"].get(entry["method"].split()[0], ())
-    return [entry["seconds"] + more for more in sorted(set(beyond))]
-
-
-def headline() -> str:
-    """Ours beside the others on each capture: seconds of training / of the whole command, PSNR, SSIM, Gaussians."""
-    lines: dict[str, dict[str, str]] = {}
-    for entry in read_json("peers.json")["rows"]:
-        walls = " to ".join(map(duration, peer_walls(entry))) or "-"
-        seconds = f"{duration(entry['seconds'])} / {walls}"
-        cell = result(seconds, f"{entry['psnr']:.2f}", entry["ssim"], entry["gaussians"])
-        lines.setdefault(entry["method"], {})[entry["capture"]] = cell
-    for row in OURS:
-        for capture, cells in row.cells().items():
-            seconds = f"{duration(mean(cells, 'seconds'))} / {duration(wall_seconds(row, capture))}"
-            cell = result(seconds, psnr_text(cells), mean(cells, "ssim"), mean(cells, "gaussians"))
-            seeds = f" ({len(cells)})" if len(cells) > 1 else ""
-            lines.setdefault(row.name, {})[capture] = cell + seeds
-    return by_capture("", lines)
-
-
-def sooner() -> str:
-    """Seconds of the others over those of `turbogs`, end against end: training alone / whole command; then PSNR and
-    SSIM of `turbogs` above theirs, and its number of Gaussians over theirs."""
-    ours = OURS[-1].cells()
-    lines: dict[str, dict[str, str]] = {}
-    for entry in read_json("peers.json")["rows"]:
-        capture, cells = entry["capture"], ours[entry["capture"]]
-        walls = [f"{wall / wall_seconds(OURS[-1], capture):.1f}" for wall in peer_walls(entry)]
-        times = f"{entry['seconds'] / mean(cells, 'seconds'):.0f} / {' to '.join(walls) or '-'} times"
-        parts = [times, f"{mean(cells, 'psnr') - entry['psnr']:+.2f} dB"]
-        parts += [f"{mean(cells, 'ssim') - entry['ssim']:+.3f}"] if entry["ssim"] else []
-        parts += [f"x {mean(cells, 'gaussians') / entry['gaussians']:.1f} N"] if entry["gaussians"] else []
-        lines.setdefault(entry["method"], {})[capture] = ", ".join(parts)
-    return by_capture("against", lines)
-
-
 def place(machine: str, commit: str, day: str = "") -> str:
     """The GPU, or the CPU where none was used; the host's cores; commit and day."""
     device, _, host = machine.partition(" (")
@@ -208,20 +139,6 @@ def where(record: Mapping[str, Any]) -> str:
     """Machine, commit, day and torch of a file that a bench wrote."""
     of = record["provenance"]
     return f"{place(of['machine'], of['commit'], of.get('day', ''))}, torch {of['software']['torch']}"
-
-
-def sources() -> str:
-    """Machine, commit and day of each row of the headline table."""
-    lines: dict[str, dict[str, None]] = {}
-    for row in OURS:
-        for cell in (cell for cells in row.cells().values() for cell in cells):
-            of = read_json(f"{row.study}/results.json")["provenances"][cell["provenance"]]
-            lines.setdefault(row.name, {})[place(of["machine"], of["commit"], of["day"])] = None
-    for row in OURS:
-        for report in read_json("wall.json").get(row.variant, {}).values() if row.study == "sizes" else ():
-            lines.setdefault(f"whole command of {row.name}", {})[where(report)] = None
-    lines["the others"] = {read_json("peers.json")["measured"]: None}
-    return table(("row", "measured on"), [(name, "; ".join(found)) for name, found in lines.items()])
 
 
 def ratio(cells: Cells, base: Cells, measure: str) -> float:
@@ -244,7 +161,7 @@ def change(cells: Cells, base: Cells, errors: str = "") -> str:
 
 def study_table(study: str, errors: str = "") -> str:
     """Every variant of a study: seconds of training, errors and Gaussians; below them the change from the baseline. In
-    a study of further captures, the mean change over all of them, too."""
+    a study of further captures, the mean change over all of them, too, of the variants that all have."""
     lines: dict[str, dict[str, str]] = {}
     found = study_cells(study)
     for capture, by_variant in found.items():
@@ -257,7 +174,8 @@ def study_table(study: str, errors: str = "") -> str:
             text += f"<br>{change(cells, baseline, errors)}" if compared else ""
             lines.setdefault(variant, {})[capture] = text
     baseline, *others = lines
-    for variant in others if len(found) > len(CAPTURES) else ():
+    everywhere = [variant for variant in others if all(variant in of for of in found.values())]
+    for variant in everywhere if len(found) > len(CAPTURES) else ():
         pairs = [(of[variant], of[baseline]) for of in found.values()]
         psnr, ssim = (Difference.over([Difference.between(*pair, of) for pair in pairs]) for of in ("psnr", "ssim"))
         lines[variant]["mean change"] = f"{psnr.text(3, ' dB')}, {ssim.text(4)}"

@@ -11,9 +11,10 @@ from studies import LAB, read_json, table, where
 
 
 def wall() -> str:
-    """Where each second of `turbogs train` goes: the median run of each capture."""
+    """Where each second of `turbogs train` goes: the run in the middle of each capture's."""
     reports = read_json("wall.json")["turbogs"]
-    runs = [report["median"] for report in reports.values()]
+    by_seconds = [sorted(report["runs"], key=lambda run: run["seconds"]) for report in reports.values()]
+    runs = [found[(len(found) - 1) // 2] for found in by_seconds]
     parts = list(dict.fromkeys(part for run in runs for part in run["parts"]))
     lines = [(part, *(f"{run['parts'].get(part, 0.0):.2f}" for run in runs)) for part in parts]
     lines += [("whole command", *(f"{run['seconds']:.2f}" for run in runs))]

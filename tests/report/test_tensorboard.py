@@ -54,5 +54,5 @@ def test_a_missing_package_is_named_before_anything_is_written(turbogs, capture,
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *TINY, ASKED)
     assert (code, out) == (2, "") and err.count("\n") == 1, err
-    assert 'needs the package tensorboard: pip install "turbogs-plugin[tensorboard]"' in err
+    assert 'needs the package tensorboard: pip install "tensorboard>=2.12"' in err
     assert list(tmp_path.iterdir()) == []

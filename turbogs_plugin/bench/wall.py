@@ -83,10 +83,10 @@ def bench_wall(arguments: Sequence[str], repeats: int) -> dict[str, Any]:
         arguments: of `turbogs train`, the capture's folder first; the record has the folder's name alone.
 
     Returns:
-        ``runs``, in their order, and ``median``, the one in the middle by what it took beside training.
+        ``runs``, in their order, and ``median``, the one in the middle by its seconds; the lower one of two.
     """
     runs = [time_command(arguments) for _ in range(repeats)]
-    middle = sorted(runs, key=lambda run: run.beside_training)[(len(runs) - 1) // 2]
+    middle = sorted(runs, key=lambda run: run.seconds)[(len(runs) - 1) // 2]
     command = ["turbogs", "train", Path(arguments[0]).name, *arguments[1:]]
     return {"command": command, "runs": [vars(run) for run in runs], "median": vars(middle)}
 

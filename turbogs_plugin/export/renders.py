@@ -27,7 +27,7 @@ PATHS = ("orbit", "views")
 SUFFIXES = (".mp4", ".mkv", ".mov")
 CODEC = "libx264"
 """Encoder of H.264, which all of these files hold; imageio-ffmpeg would try others first."""
-INSTALL = 'pip install "turbogs-plugin[video]"'
+INSTALL = 'pip install "imageio-ffmpeg>=0.5"'
 QUALITY = 8
 """Quality for imageio-ffmpeg, 0 .. 10."""
 

@@ -27,7 +27,7 @@ from turbogs_plugin.train.session import RunSession
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
-INSTALL = 'pip install "turbogs-plugin[tensorboard]"'
+INSTALL = 'pip install "tensorboard>=2.12"'
 WIDEST_STRIP = 900
 """Pixels. A strip of every view at every evaluation would take hundreds of megabytes at full size."""
 GROUPS = {"num_gaussians": "counts", "nonfinite_losses": "counts", "skipped_updates": "counts"}

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 JPEG_QUALITY = 85
 POLL_SECONDS = 0.02
 """Seconds between two looks at what the page asks for, where no frame is due."""
-INSTALL = 'pip install "turbogs-plugin[viewer]"'
+INSTALL = 'pip install "viser>=1.1,<2"'
 
 
 def quiet_server(host: str, port: int) -> viser.ViserServer:

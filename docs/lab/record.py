@@ -1,0 +1,187 @@
+"""README's sentence, table and plot, and the tables of docs/comparison.md: docs/lab/record beside other programs.
+
+Rows are those of ``record`` in rows.yaml. A method's number is a mean over five captures of its means over seeds, and
+missing where one capture has none.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import statistics
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from matplotlib.figure import Figure
+from PIL import Image
+from studies import LAB, ROWS, Cells, duration, place, read_json, study_cells, table
+
+CAPTURES = ("fox", "caliterra", "snowmiku", "bonsai", "train")
+PICTURE = LAB / "headline.png"
+BYTES = 59 * 4
+"""Of a Gaussian with three bands of harmonics in single precision, without normals, in every program here."""
+
+MEASURES: dict[str, tuple[str, Callable[[float], str]]] = {
+    "psnr": ("PSNR", "{:.2f}".format),
+    "ssim": ("SSIM", lambda value: f"{value:.3f}".lstrip("0")),
+    "seconds": ("train s", duration),
+    "wall_seconds": ("command s", duration),
+    "gaussians": ("Gaussians", lambda value: f"{value / 1e6:.2f}M" if value >= 1e6 else f"{value / 1e3:.0f}k"),
+    "megabytes": ("MB", "{:.0f}".format),
+    "peak_gib": ("GiB", "{:.1f}".format),
+    "fps": ("FPS", "{:.0f}".format),
+}
+"""Measure of a training -> its heading and its text. README's table has the first five."""
+
+
+def text(measure: str, value: float) -> str:
+    return "-" if math.isnan(value) else MEASURES[measure][1](value)
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of the tables.
+
+    Args:
+        name: as the tables have it.
+        peer: another program, whose runs are in peers.json; "": ours, in docs/lab/record.
+        of: capture -> the variant of the study, or the number of Gaussians that the other program was asked for.
+        color, label: of its curve in the plot, and where its name stands beside the curve's end, in points, for PSNR
+            and SSIM; "": not drawn.
+    """
+
+    name: str
+    of: Mapping[str, Any]
+    peer: str = ""
+    color: str = ""
+    label: tuple[tuple[float, float], ...] = ()
+
+    def cells(self, capture: str) -> Cells:
+        """Trainings, with the measures of `MEASURES` that are known."""
+        if not self.peer:
+            return study_cells("record").get(capture, {}).get(self.of[capture], [])
+        runs = read_json("peers.json")["runs"].values()
+        asked = (self.peer, capture, self.of[capture])
+        return [as_cell(run) for run in runs if (run["name"], run["scene"], run.get("target_primitives")) == asked]
+
+    def mean(self, measure: str, *captures: str) -> float:
+        """NaN where one of the captures, of all five where none is named, lacks the measure."""
+        known = [[measures(cell)[measure] for cell in self.cells(of)] for of in captures or CAPTURES]
+        return statistics.fmean(statistics.fmean(values or [math.nan]) for values in known)
+
+    def curve(self, measure: str) -> list[float]:
+        """Means over the captures at each evaluation; empty where a capture has no curve."""
+        found = [[cell["curve"][measure] for cell in self.cells(of) if cell["curve"]] for of in CAPTURES]
+        means = [map(statistics.fmean, zip(*curves, strict=True)) for curves in found if curves]
+        return list(map(statistics.fmean, zip(*means, strict=True))) if all(found) else []
+
+
+METHODS = [Method(**row) for row in ROWS["record"]]
+
+
+def as_cell(run: Mapping[str, Any]) -> dict[str, Any]:
+    """A run of peers.json as a training of a study."""
+    names = {"gaussians": "num_gaussians", "peak_gib": "peak_memory_gib"}
+    final = {measure: run[name] for measure in MEASURES if (name := names.get(measure, measure)) in run}
+    return {"final": final, "curve": run.get("history"), "variant": "", "scene": run["scene"]}
+
+
+def measures(cell: Mapping[str, Any]) -> dict[str, float]:
+    """Every measure of a training; NaN for what is not known."""
+    found = dict.fromkeys(MEASURES, math.nan) | cell["final"]
+    found["megabytes"] = found["gaussians"] * BYTES / 1e6
+    found["peak_gib"] = found["peak_mib"] / 1024 if "peak_mib" in found else found["peak_gib"]
+    timed = read_json("wall.json").get(cell["variant"], {}).get(cell["scene"])  # of ours, at the record's commit
+    if timed and timed["provenance"]["commit"] in [of["commit"] for of in provenances()]:
+        found["wall_seconds"] = statistics.median(run["seconds"] for run in timed["runs"])
+    return found
+
+
+def provenances() -> list[dict[str, Any]]:
+    return read_json("record/results.json")["provenances"] if study_cells("record") else []
+
+
+def headline() -> str:
+    """Means over the five captures, the best of each column in bold."""
+    shown, columns = list(MEASURES)[:5], []
+    for measure in shown:
+        values = [method.mean(measure) for method in METHODS]
+        known = [value for value in values if not math.isnan(value)]
+        best = text(measure, (max if measure in ("psnr", "ssim") else min)(known, default=math.nan))
+        columns.append(
+            [f"**{cell}**" if cell == best != "-" else cell for cell in (text(measure, of) for of in values)]
+        )
+    names = [method.name for method in METHODS]
+    return table(("", *(MEASURES[of][0] for of in shown)), zip(names, *columns, strict=True))
+
+
+def claim() -> str:
+    """README's sentence: two rows of its table."""
+    found = {of.name: [text(measure, of.mean(measure)) for measure in list(MEASURES)[:3]] for of in METHODS}
+    ours, theirs = (
+        f"{psnr} dB, {ssim} SSIM after {s} s" for psnr, ssim, s in map(found.get, ("turbogs, no exposures", "FastGS"))
+    )
+    return f"**{ours} of training; FastGS: {theirs}. Means over five captures, one H200.**"
+
+
+def by_capture() -> str:
+    """Every method on every capture; another program at each number of Gaussians that it was asked for."""
+    runs, lines = read_json("peers.json")["runs"].values(), []
+    for capture in CAPTURES:
+        asked = dict.fromkeys((run["name"], run.get("target_primitives")) for run in runs if run["scene"] == capture)
+        for method in (
+            *(Method(name, {capture: of}, name) for name, of in asked),
+            *(of for of in METHODS if not of.peer),
+        ):
+            if cells := method.cells(capture):
+                texts = (text(measure, method.mean(measure, capture)) for measure in MEASURES)
+                lines.append((capture, method.name, *texts, len(cells)))
+    return table(("capture", "method", *(heading for heading, _ in MEASURES.values()), "seeds"), lines)
+
+
+def held() -> str:
+    """Captures that no setting was chosen on: seconds of training, PSNR, SSIM and Gaussians, means over seeds."""
+    record, lines = read_json("held.json"), {}
+    for entry in (*record["others"], *record["ours"]):
+        method, _, cap = (entry.get("method") or entry["settings"]).partition(", max_gaussians ")
+        cell = ", ".join(text(of, entry.get(of, math.nan)) for of in ("seconds", "psnr", "ssim", "gaussians"))
+        lines.setdefault(entry["scene"], {}).setdefault(f"{method} at a cap" if cap else method, []).append(cell)
+    names = dict.fromkeys(name for cells in lines.values() for name in cells)
+    rows = [(scene, *("<br>".join(cells.get(name, "-")) for name in names)) for scene, cells in lines.items()]
+    return table(("capture", *names), rows)
+
+
+def sources() -> str:
+    """Machine, commit and day of the record, and where the others ran."""
+    ours = dict.fromkeys(place(of["machine"], of["commit"], of["day"]) for of in provenances())
+    others = read_json("peers.json")["method"]["what"]
+    return table(("rows", "measured on"), [("ours", "; ".join(ours) or "-"), ("the others", others)])
+
+
+def draw(drawn: list[tuple[dict[str, Any], dict[str, list[float]]]]) -> Figure:
+    """PSNR, and beside it SSIM, against seconds of training: a curve a method, its name at its end."""
+    figure = Figure(figsize=(11.0, 4.2), layout="constrained")
+    for number, (axis, measure) in enumerate(zip(figure.subplots(1, 2), ("psnr", "ssim"), strict=True)):
+        for row, curve in drawn:
+            axis.plot(curve["seconds"], curve[measure], color=row["color"], marker="o", markevery=[-1])
+            end, shift = (curve["seconds"][-1], curve[measure][-1]), {"textcoords": "offset points"}
+            axis.annotate(row["name"].partition(", at")[0], end, row["label"][number], color=row["color"], **shift)
+        top, span = max([curve[measure][-1] for _, curve in drawn], default=1.0), (6.0, 0.12)[number]
+        axis.set(xlabel="seconds of training", xscale="log", xlim=(0.6, 250), ylim=(top - span, top + 0.08 * span))
+        axis.set_title(("test PSNR in dB", "test SSIM")[number], loc="left")
+        axis.set_xticks([1, 3, 10, 30, 100], ["1", "3", "10", "30", "100"])
+        axis.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def draw_picture() -> None:
+    """Draw README's plot where the file was drawn of other data."""
+    curves = [
+        (asdict(of), {name: of.curve(name) for name in ("seconds", "psnr", "ssim")}) for of in METHODS if of.color
+    ]
+    drawn = [pair for pair in curves if pair[1]["psnr"]]
+    digest = hashlib.sha256(json.dumps(drawn).encode()).hexdigest()[:16]
+    if not PICTURE.is_file() or Image.open(PICTURE).info.get("Comment") != digest:
+        draw(drawn).savefig(PICTURE, dpi=90, metadata={"Comment": digest})
