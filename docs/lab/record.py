@@ -11,7 +11,7 @@ import json
 import math
 import statistics
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -48,15 +48,13 @@ class Method:
         name: as the tables have it.
         peer: another program, whose runs are in peers.json; "": ours, in docs/lab/record.
         of: capture -> the variant of the study, or the number of Gaussians that the other program was asked for.
-        color, label: of its curve in the plot, and where its name stands beside the curve's end, in points, for PSNR
-            and SSIM; "": not drawn.
+        color: of its curve in the plot; "": not drawn.
     """
 
     name: str
     of: Mapping[str, Any]
     peer: str = ""
     color: str = ""
-    label: tuple[tuple[float, float], ...] = ()
 
     def cells(self, capture: str) -> Cells:
         """Trainings, with the measures of `MEASURES` that are known."""
@@ -160,17 +158,21 @@ def sources() -> str:
     return table(("rows", "measured on"), [("ours", "; ".join(ours) or "-"), ("the others", others)])
 
 
-def draw(drawn: list[tuple[dict[str, Any], dict[str, list[float]]]]) -> Figure:
-    """PSNR, and beside it SSIM, against seconds of training: a curve a method, its name at its end."""
+def draw(drawn: list[tuple[str, str, dict[str, list[float]]]]) -> Figure:
+    """PSNR, and beside it SSIM, against seconds of training: a curve a method (name, colour, columns)."""
     figure = Figure(figsize=(11.0, 4.2), layout="constrained")
-    for number, (axis, measure) in enumerate(zip(figure.subplots(1, 2), ("psnr", "ssim"), strict=True)):
-        for row, curve in drawn:
-            axis.plot(curve["seconds"], curve[measure], color=row["color"], marker="o", markevery=[-1])
-            end, shift = (curve["seconds"][-1], curve[measure][-1]), {"textcoords": "offset points"}
-            axis.annotate(row["name"].partition(", at")[0], end, row["label"][number], color=row["color"], **shift)
-        top, span = max([curve[measure][-1] for _, curve in drawn], default=1.0), (6.0, 0.12)[number]
-        axis.set(xlabel="seconds of training", xscale="log", xlim=(0.6, 250), ylim=(top - span, top + 0.08 * span))
-        axis.set_title(("test PSNR in dB", "test SSIM")[number], loc="left")
+    for axis, (measure, span) in zip(figure.subplots(1, 2), (("psnr", 6.0), ("ssim", 0.12)), strict=True):
+        names: list[tuple[float, float]] = []  # each beside its curve's end, or a little below, clear of the others
+        for name, color, curve in sorted(drawn, key=lambda of: -of[2][measure][-1]):
+            axis.plot(curve["seconds"], curve[measure], color=color, marker="o", markevery=[-1])
+            end, place = curve["seconds"][-1], curve[measure][-1]
+            while any(abs(place - other) < 0.06 * span and 0.25 < end / at < 4.0 for at, other in names):
+                place -= 0.01 * span
+            names.append((end, place))
+            axis.text(1.15 * end, place, name, color=color, verticalalignment="center")
+        top = max(curve[measure][-1] for *_, curve in drawn)
+        axis.set(xlabel="seconds of training", xscale="log", xlim=(0.6, 320), ylim=(top - span, top + 0.06 * span))
+        axis.set_title({"psnr": "test PSNR in dB", "ssim": "test SSIM"}[measure], loc="left")
         axis.set_xticks([1, 3, 10, 30, 100], ["1", "3", "10", "30", "100"])
         axis.spines[["top", "right"]].set_visible(False)
     return figure
@@ -178,10 +180,9 @@ def draw(drawn: list[tuple[dict[str, Any], dict[str, list[float]]]]) -> Figure:
 
 def draw_picture() -> None:
     """Draw README's plot where the file was drawn of other data."""
-    curves = [
-        (asdict(of), {name: of.curve(name) for name in ("seconds", "psnr", "ssim")}) for of in METHODS if of.color
-    ]
-    drawn = [pair for pair in curves if pair[1]["psnr"]]
+    columns = ("seconds", "psnr", "ssim")
+    drawn = [(of.name.partition(", at")[0], of.color, {name: of.curve(name) for name in columns}) for of in METHODS]
+    drawn = [entry for entry in drawn if entry[1] and entry[2]["psnr"]]
     digest = hashlib.sha256(json.dumps(drawn).encode()).hexdigest()[:16]
     if not PICTURE.is_file() or Image.open(PICTURE).info.get("Comment") != digest:
         draw(drawn).savefig(PICTURE, dpi=90, metadata={"Comment": digest})
