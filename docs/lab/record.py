@@ -121,7 +121,7 @@ def claim() -> str:
     ours, theirs = (
         f"{psnr} dB, {ssim} SSIM after {s} s" for psnr, ssim, s in map(found.get, ("turbogs, no exposures", "FastGS"))
     )
-    return f"**{ours} of training; FastGS: {theirs}. Means over five captures, one H200.**"
+    return f"**{ours} of training; FastGS: {theirs}. Means over five captures.**"
 
 
 def by_capture() -> str:
