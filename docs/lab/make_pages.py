@@ -19,7 +19,6 @@ from studies import LAB
 ROOT = LAB.parents[1]
 BLOCK = re.compile(r"(<!-- made: ([\w -]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
-
 TABLES: dict[str, Callable[[], str]] = {
     "claim": record.claim,
     "headline": record.headline,
@@ -39,7 +38,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "dropin": timings.dropin,
     "pixels on an mlp": timings.pixels_on_an_mlp,
 }
-
 
 BY_OTHERS = ("solvers", "density_sums")
 

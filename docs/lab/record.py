@@ -77,6 +77,7 @@ class Method:
 
 
 METHODS = [Method(**row) for row in ROWS["record"]]
+PROVENANCES = read_json("record/results.json")["provenances"] if study_cells("record") else []
 
 
 def as_cell(run: Mapping[str, Any]) -> dict[str, Any]:
@@ -92,13 +93,9 @@ def measures(cell: Mapping[str, Any]) -> dict[str, float]:
     found["megabytes"] = found["gaussians"] * BYTES / 1e6
     found["peak_gib"] = found["peak_mib"] / 1024 if "peak_mib" in found else found["peak_gib"]
     timed = read_json("wall.json").get(cell["variant"], {}).get(cell["scene"])  # of ours, at the record's commit
-    if timed and timed["provenance"]["commit"] in [of["commit"] for of in provenances()]:
+    if timed and timed["provenance"]["commit"] in [of["commit"] for of in PROVENANCES]:
         found["wall_seconds"] = statistics.median(run["seconds"] for run in timed["runs"])
     return found
-
-
-def provenances() -> list[dict[str, Any]]:
-    return read_json("record/results.json")["provenances"] if study_cells("record") else []
 
 
 def headline() -> str:
@@ -108,19 +105,16 @@ def headline() -> str:
         values = [method.mean(measure) for method in METHODS]
         known = [value for value in values if not math.isnan(value)]
         best = text(measure, (max if measure in ("psnr", "ssim") else min)(known, default=math.nan))
-        columns.append(
-            [f"**{cell}**" if cell == best != "-" else cell for cell in (text(measure, of) for of in values)]
-        )
+        texts = [text(measure, value) for value in values]
+        columns.append([f"**{cell}**" if cell == best != "-" else cell for cell in texts])
     names = [method.name for method in METHODS]
     return table(("", *(MEASURES[of][0] for of in shown)), zip(names, *columns, strict=True))
 
 
 def claim() -> str:
     """README's sentence: two rows of its table."""
-    found = {of.name: [text(measure, of.mean(measure)) for measure in list(MEASURES)[:3]] for of in METHODS}
-    ours, theirs = (
-        f"{psnr} dB, {ssim} SSIM after {s} s" for psnr, ssim, s in map(found.get, ("turbogs, no exposures", "FastGS"))
-    )
+    texts = {of.name: [text(measure, of.mean(measure)) for measure in list(MEASURES)[:3]] for of in METHODS}
+    ours, theirs = ("{} dB, {} SSIM after {} s".format(*texts[name]) for name in ("turbogs, no exposures", "FastGS"))
     return f"**{ours} of training; FastGS: {theirs}. Means over five captures.**"
 
 
@@ -129,10 +123,8 @@ def by_capture() -> str:
     runs, lines = read_json("peers.json")["runs"].values(), []
     for capture in CAPTURES:
         asked = dict.fromkeys((run["name"], run.get("target_primitives")) for run in runs if run["scene"] == capture)
-        for method in (
-            *(Method(name, {capture: of}, name) for name, of in asked),
-            *(of for of in METHODS if not of.peer),
-        ):
+        peers = [Method(name, {capture: of}, name) for name, of in asked]
+        for method in (*peers, *(of for of in METHODS if not of.peer)):
             if cells := method.cells(capture):
                 texts = (text(measure, method.mean(measure, capture)) for measure in MEASURES)
                 lines.append((capture, method.name, *texts, len(cells)))
@@ -153,7 +145,7 @@ def held() -> str:
 
 def sources() -> str:
     """Machine, commit and day of the record, and where the others ran."""
-    ours = dict.fromkeys(place(of["machine"], of["commit"], of["day"]) for of in provenances())
+    ours = dict.fromkeys(place(of["machine"], of["commit"], of["day"]) for of in PROVENANCES)
     others = read_json("peers.json")["method"]["what"]
     return table(("rows", "measured on"), [("ours", "; ".join(ours) or "-"), ("the others", others)])
 
