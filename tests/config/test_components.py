@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from turbogs_plugin.config import components
 from turbogs_plugin.config.components import build
@@ -12,6 +13,10 @@ from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies import TYPES
+from turbogs_plugin.train.run import resume
+from turbogs_plugin.train.run_files import RunFolder
+from turbogs_plugin.train.saved_model import load_model
+from turbogs_plugin.yaml_json import yaml_text
 
 MODULE = """
 from dataclasses import dataclass
@@ -72,7 +77,7 @@ def plug_in(monkeypatch):
 
     def plug_in(kind: str, name: str, value: str) -> None:
         point = importlib.metadata.EntryPoint(name, value, f"turbogs.{kind}")
-        monkeypatch.setattr(components, "entry_points", lambda group: [point] if group == f"turbogs.{kind}" else [])
+        monkeypatch.setattr(components, "entry_points", lambda group, **_: [point] * (group == point.group))
         monkeypatch.syspath_prepend(".")
 
     return plug_in
@@ -128,6 +133,45 @@ REFUSED = [
 def test_what_does_not_fit_is_refused(kind, mapping, words):
     with pytest.raises(InputError, match=words):
         build(kind, mapping)
+
+
+RAN = "import pathlib; pathlib.Path('ran').touch()\n" + MODULE
+
+
+@pytest.fixture
+def shared_run(tmp_path):
+    """A run whose density control lies beside its configuration, and notes that it was imported."""
+    (tmp_path / "third_party.py").write_text(RAN)
+    config = load_config("turbogs", ["scene.path=none"]).without_plan().to_mapping()
+    config["density"] = {"type": "third_party:Fading", "opacity_decay": 0.2}
+    (tmp_path / "config.yaml").write_text(yaml_text(config))
+    return RunFolder(tmp_path)
+
+
+def test_reading_a_run_imports_nothing_that_it_names(shared_run, monkeypatch):
+    monkeypatch.syspath_prepend(".")
+    assert shared_run.read_config().density["type"] == "third_party:Fading"
+    for command in (lambda: load_model(shared_run.path, torch.device("cpu")), lambda: resume(shared_run.path)):
+        with pytest.raises(InputError):
+            command()
+    assert not Path("ran").exists()
+
+
+@pytest.mark.parametrize("by_entry_point", [False, True])
+def test_code_of_a_run_that_is_not_installed_needs_trust(shared_run, plug_in, monkeypatch, capsys, by_entry_point):
+    if by_entry_point:  # of a package in the run's own folder
+        plug_in("density", "fading", "third_party:Fading")
+        shared_run.config.write_text(shared_run.config.read_text().replace("third_party:Fading", "fading"))
+    with pytest.raises(InputError, match=r"config.yaml': density.type '.*third_party\.py\): .* --trust"):
+        shared_run.read_config(built=True)
+    assert not Path("ran").exists() and not capsys.readouterr().err
+    shared_run.read_config(built=True, trusted=True)
+    assert Path("ran").exists() and "third_party.py" in capsys.readouterr().err
+
+
+def test_an_installed_module_of_a_run_needs_no_trust(shared_run, monkeypatch, tmp_path):
+    monkeypatch.setattr(components.site, "getsitepackages", lambda: [str(tmp_path)])
+    assert shared_run.read_config(built=True).density["opacity_decay"] == 0.2
 
 
 def test_a_class_that_does_not_inherit_has_the_defaults_of_its_protocol():

@@ -176,7 +176,7 @@ def test_the_configuration_of_a_run_is_complete():
     assert resolve_complete(undecided, "config.yaml").to_mapping() == undecided
     for given in (mapping, undecided):
         with pytest.raises(InputError, match=r"config\.yaml' lacks settings"):
-            resolve_complete(given, "config.yaml", decided=True)
+            resolve_complete(given, "config.yaml", decided=True, built=True)
 
 
 def test_bands_open_on_their_schedule():

@@ -64,7 +64,7 @@ def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
     finite, and a run goes on by a step or refuses."""
     monkeypatch.setattr(run.RunSession, "run", lambda session, *_: session.trainer.step())
     config = run.RunFolder(finished).read_config()
-    monkeypatch.setattr(run.RunFolder, "read_config", lambda folder: copy.deepcopy(config))
+    monkeypatch.setattr(run.RunFolder, "read_config", lambda *_: copy.deepcopy(config))
     scene = load_scene(config.scene.path)
     monkeypatch.setattr(inputs, "load_scene", lambda *_, **__: scene)
     state = load_checkpoint(latest_checkpoint(finished / "checkpoints"))

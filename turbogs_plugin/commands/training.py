@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from turbogs_plugin.commands.options import LOCAL, NO_OPTIONS, PORT, Count, Flat, Overrides, Scene, is_change
 from turbogs_plugin.errors import InputError
@@ -33,6 +33,7 @@ def train(
     viewer: Annotated[tuple[int, ...] | None, arg(metavar="[PORT]")] = None,
     viewer_host: str = LOCAL,
     gpus: Count = None,
+    trust: FlagCreatePairsOff[bool] = False,
     options: Flat = NO_OPTIONS,
 ) -> int:
     """Train on a capture, or go on with a stopped run.
@@ -50,6 +51,7 @@ def train(
         viewer_host: address where the viewer listens; 0.0.0.0 lets others on the network look, and pause the training.
         gpus: number of this machine's GPUs that train one model, a process each; torchrun does the same on several
             machines. docs/scaling.md says what they gain.
+        trust: with --resume, run the code that the run's configuration names and that is not installed.
     """
     clock = WallClock()
     if viewer is None and viewer_host != LOCAL:
@@ -57,11 +59,13 @@ def train(
     if resume is not None:
         if scene or overrides or out or options != NO_OPTIONS:
             raise InputError(
-                "--resume goes on by the run's own configuration: give it nothing else but --no-report, --viewer and "
-                "--gpus"
+                "--resume goes on by the run's own configuration: give it nothing else but --no-report, --viewer, "
+                "--gpus and --trust"
             )
     elif scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
+    elif trust:
+        raise InputError("--trust is for --resume: a configuration that you name yourself is your own word")
     if gpus is not None and gpus < 1:
         raise InputError(f"--gpus {gpus}: it must be at least 1")
     if viewer is not None and (gpus or 1) > 1:
@@ -83,7 +87,7 @@ def train(
     page, watch = write_report if report else None, event_writers(settings)
     with joined(settings.train.device) as ranks, ExitStack() as pages:
         if out is not None and restarts() and run.RunFolder(out).config.is_file():
-            resume = out
+            resume, trust = out, True  # the configuration is this command's own
         live = None
         if viewer is not None:
             if ranks.count > 1:
@@ -96,7 +100,7 @@ def train(
             watch.append(live.watch)
         folder = resume or out
         assert folder is not None  # one of them is named
-        begin = partial(run.resume, folder) if resume else partial(run.train, settings, folder)
+        begin = partial(run.resume, folder, trusted=trust) if resume else partial(run.train, settings, folder)
         session = begin(page, clock, ranks, watch)
         code = _tell(session, report) if ranks.first else 128 + session.signal if session.signal else 0
         if live is not None and session.signal is None:

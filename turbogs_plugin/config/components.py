@@ -13,10 +13,14 @@ imported before it is named.
 from __future__ import annotations
 
 import os
+import re
+import site
 import sys
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.machinery import PathFinder
+from importlib.metadata import EntryPoint, distributions, entry_points
+from pathlib import Path
 from typing import Any
 
 from turbogs_plugin.config.typed import build_dataclass
@@ -57,6 +61,28 @@ def strategy_class(kind: str, name: Any) -> type:
         raise InputError(f"{place} cannot be imported: {reason}") from error
     if not (isinstance(found, type) and is_dataclass(found)):
         raise InputError(f"{place} is not a dataclass, whose init fields would be its configuration")
+    return found
+
+
+def foreign_code(mapping: Mapping[str, Any]) -> dict[str, str]:
+    """Types in a configuration whose code nobody installed: ``section.type 'name'`` -> the file that importing it would
+    run. Nothing is imported.
+
+    Installed are the built-in types, entry points of packages in Python's own folders, and modules that lie there.
+    """
+    places = [folder for folder in (*site.getsitepackages(), site.getusersitepackages()) if folder]
+    installed = {(point.group, point.name) for each in distributions(path=places) for point in each.entry_points}
+    found = {}
+    for kind in KINDS:
+        name, group = str(mapping[kind].get("type", default_type(kind))), f"turbogs.{kind}"
+        values = [name] if ":" in name else [point.value for point in entry_points(group=group, name=name)]
+        if name in TYPES[kind] or (group, name) in installed:
+            continue
+        for value in values:
+            spec = PathFinder.find_spec(re.split("[.:]", value)[0], [*sys.path, os.getcwd()])
+            file = str(spec and (spec.origin or spec.name))
+            if not {*map(Path, places)} & {*Path(file).parents}:
+                found[f"{kind}.type '{name}'"] = file if spec else "no such module is there"
     return found
 
 

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from textwrap import indent
 from typing import Any, get_type_hints
 
-from turbogs_plugin.config.components import KINDS, build, default_type, strategy_class
+from turbogs_plugin.config.components import KINDS, build, default_type, foreign_code, strategy_class
 from turbogs_plugin.config.sections import (
     AUTO,
     AUTO_SETTINGS,
@@ -130,8 +131,12 @@ def settings_text(config: Config) -> str:
     return "\n".join(parts)
 
 
-def resolve(mapping: Mapping[str, Any]) -> Config:
-    """The complete, checked configuration of a mapping of sections; absent sections have their defaults."""
+def resolve(mapping: Mapping[str, Any], built: bool = True) -> Config:
+    """The complete, checked configuration of a mapping of sections; absent sections have their defaults.
+
+    Args:
+        built: whether strategies are built, which imports and checks them; else their sections are taken as they are.
+    """
     for section in mapping:
         if section not in SECTION_CLASSES and section not in KINDS:
             raise InputError(f"unknown section '{section}': {nearest(section, [*SECTION_CLASSES, *KINDS])}")
@@ -140,23 +145,37 @@ def resolve(mapping: Mapping[str, Any]) -> Config:
     }
     for kind in KINDS:
         section = mapping.get(kind, {})
-        strategy = build(kind, section)
-        sections[kind] = {"type": section.get("type", default_type(kind)), **dataclass_mapping(strategy)}
+        if built:
+            strategy = build(kind, section)
+            section = {"type": section.get("type", default_type(kind)), **dataclass_mapping(strategy)}
+        sections[kind] = section
     return Config(**sections)
 
 
-def resolve_complete(mapping: Mapping[str, Any], where: str, decided: bool = False) -> Config:
+def resolve_complete(
+    mapping: Mapping[str, Any], where: str, decided: bool = False, built: bool = False, trusted: bool = False
+) -> Config:
     """`resolve` of the mapping that a run has written.
 
     Args:
         where: the file, for messages.
         decided: whether nothing may be left to a plan.
+        built: as for `resolve`; only a training uses strategies.
+        trusted: whether code may run that nobody installed. A line on stderr names its files.
 
     Raises:
-        InputError: a part of it is missing or, where that is asked for, left to a plan.
+        InputError: a part of it is missing or, where that is asked for, left to a plan; or it names code that is not
+            installed.
     """
+    for section in KINDS:
+        if not isinstance(mapping.get(section), Mapping):
+            raise InputError(f"'{where}': section '{section}' is missing: bring the file back, or train anew")
+    for what, file in foreign_code(mapping).items() if built else ():
+        if not trusted:
+            raise InputError(f"'{where}': {what} runs code that is not installed ({file}): read it, then give --trust")
+        print(f"turbogs: {what} of '{where}' runs {file}", file=sys.stderr)
     try:
-        config = resolve(mapping)
+        config = resolve(mapping, built)
     except InputError as error:
         raise InputError(f"'{where}': {error}; bring back what was written there") from None
     if mapping != config.to_mapping() or (decided and undecided(mapping)):

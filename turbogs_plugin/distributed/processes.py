@@ -68,6 +68,7 @@ def start(count: int, arguments: Sequence[str], device: str = "auto", module: st
         raise InputError(f"--gpus {count}: {present} GPUs answer here; ask for as many, or see 'turbogs doctor'")
     logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)  # the processes say what happened
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, processor_cores() // count)))
+    os.environ.setdefault("PYTHONSAFEPATH", "1")  # else "-m" imports modules of the current folder first
     meeting: dict[str, Any] = {"rdzv_backend": "c10d", "rdzv_endpoint": "localhost:0", "local_addr": "localhost"}
     config = LaunchConfig(1, 1, count, run_id=uuid.uuid4().hex, max_restarts=0, monitor_interval=0.1, **meeting)
     try:

@@ -19,6 +19,7 @@ STYLE: dict[Any, Any] = {
     "lines.linewidth": 1.8,
     "lines.markersize": 5,
     "text.parse_math": False,  # a capture's name may hold dollars
+    "text.usetex": False,  # a matplotlibrc in the current folder may ask for LaTeX, a program
 }
 """matplotlib's settings for every plot of the project."""
 

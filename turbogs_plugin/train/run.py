@@ -153,7 +153,12 @@ def train(
 
 
 def resume(
-    path: Path, report: Report | None = None, clock: WallClock | None = None, ranks: Ranks = ONE, watch: Watch = ()
+    path: Path,
+    report: Report | None = None,
+    clock: WallClock | None = None,
+    ranks: Ranks = ONE,
+    watch: Watch = (),
+    trusted: bool = False,
 ) -> RunSession:
     """Go on with a stopped run from its newest checkpoint, with its own configuration, in which nothing is `auto`.
 
@@ -161,6 +166,7 @@ def resume(
 
     Args:
         report, clock, ranks, watch: as in `train`. The number of processes may be another than before.
+        trusted: as for `resolve_complete`.
 
     Raises:
         InputError: no run there, a finished one without checkpoints, an unusable checkpoint, a changed
@@ -170,7 +176,7 @@ def resume(
     clock = clock or WallClock()
     clock.mark(IMPORTS)
     folder = RunFolder(path)
-    config = folder.read_config()
+    config = folder.read_config(True, trusted)
     require_device(config.train.device)
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None and folder.model.is_file():

@@ -51,16 +51,17 @@ class RunFolder:
         that is `reported`."""
         return self.model.is_file() and (self.report.is_file() or not reported)
 
-    def read_config(self) -> Config:
-        """The resolved configuration of the run. Raises `InputError` if this is no run, or part of it is missing."""
-        return self._read(self.config, decided=True)
+    def read_config(self, built: bool = False, trusted: bool = False) -> Config:
+        """The resolved configuration of the run. Raises `InputError` if this is no run, or part of it is missing.
+        Arguments as of `resolve_complete`."""
+        return self._read(self.config, True, built, trusted)
 
     def read_asked(self) -> Config:
         """The configuration that was asked for. Raises `InputError` if it is missing or incomplete."""
-        return self._read(self.asked, decided=False)
+        return self._read(self.asked, False)
 
-    def _read(self, file: Path, decided: bool) -> Config:
+    def _read(self, file: Path, *how: bool) -> Config:
         if not file.is_file():
             lacks = f"{file.name} in it" if self.path.exists() else "such folder"
             raise InputError(f"'{self.path}' holds no run: there is no {lacks}; give a folder that train --out made")
-        return resolve_complete(read_yaml(file), str(file), decided)
+        return resolve_complete(read_yaml(file), str(file), *how)
