@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from helpers.bounded_memory import outcome_within
 from helpers.refusals import assert_refused
 from PIL import ExifTags, Image
 
@@ -54,6 +55,29 @@ def test_a_tiff_that_pillow_would_turn_is_refused(tmp_path, orientation):
 def test_what_is_no_photo_is_named_by_its_content(tmp_path, start, said):
     (tmp_path / "photo.jpg").write_bytes(start + (start and bytes(100)))
     assert_refused(f"cannot read the photo .*photo.jpg: {said}", photo_sizes, [tmp_path / "photo.jpg"])
+@pytest.mark.parametrize("form", [*decoding.FORMATS, "MPO", "EPS", "PDF", "GIF", "PPM", "WEBP", "TGA", "ICO", "SGI"])
+def test_only_photos_are_photos(tmp_path, form, monkeypatch):
+    """By their content; a format that Pillow knows and cameras do not write never comes to its decoder."""
+    monkeypatch.setattr("subprocess.Popen", None)  # PostScript would start a program
+    path = tmp_path / "photo.png"
+    Image.new("RGB", (64, 48)).save(path, format=form)
+    if form in (*decoding.FORMATS, "MPO"):
+        assert decoding.photo_size(path) == (64, 48)
+    else:
+        assert_refused("cannot read the photo .*photo.png: it is ", decoding.photo_size, path)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda path: Image.new("1", (8000, 8000), 1).save(path),
+        lambda path: Image.new("1", (8000, 6000)).save(path, "TIFF", compression="group4"),
+    ],
+)
+def test_pixels_are_compared_with_bytes_before_they_are_decoded(tmp_path, make):
+    make(path := tmp_path / "photo.png")
+    error = outcome_within(8 << 20, photo_sizes, [path])
+    assert "bytes, which no photo has: replace it" in str(error)
 
 
 def test_what_ends_it_ends_the_decoding(capture, monkeypatch):

@@ -164,7 +164,7 @@ PANORAMA = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
         ({"IMG_1.HEIC": b"x"}, r"has 0 photos \(1 file is of a kind that is not read \(IMG_1.HEIC\)"),
         ({"3.jpg": stored()[:-200]}, "cannot read the photo .*3.jpg.*replace it"),
         ({"5.jpg": stored(xmp=PANORAMA)}, "5.jpg is a panorama by its XMP .*: cut it into perspective photos"),
-        ({"5.jpg": stored("GIF")}, "5.jpg has GIF inside, .*: convert it to JPEG"),
+        ({"5.jpg": stored("GIF")}, "5.jpg: it is of another kind; convert it to JPEG"),
         ({"5.png": Image.fromarray(np.zeros((32, 48), dtype=np.uint16))}, "5.png has more than 8 bits"),
         ({"a b.jpg": picture(), "a_b.jpg": picture()}, "2 photos .*'a_b.jpg' without spaces"),
     ],

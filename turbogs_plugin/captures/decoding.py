@@ -38,6 +38,13 @@ KINDS = (
     (rb"PK\x03\x04|\x1f\x8b|7z\xbc\xaf|Rar!", "an archive", "unpack it"),
 )
 """What files under the names of photos may be that Pillow does not read: their first bytes, and what to do."""
+FORMATS = ("JPEG", "PNG", "TIFF", "BMP")
+"""Formats of images, told by content. Pillow would try dozens, PostScript among them, for which it starts a program."""
+OTHER_FORMATS = {".webp": "WEBP", ".avif": "AVIF", ".jp2": "JPEG2000"}
+"""Suffix -> the format that files of it may have besides."""
+PIXELS_A_BYTE, ALWAYS_PIXELS = 128, 1 << 25
+"""Most pixels of an image for each byte of its file, and pixels that any file may have: files of a few kilobytes can
+unpack to gigabytes. A photo has 1 to 20 pixels a byte, an even grey one of JPEG 64."""
 MOST_THREADS = 16
 """Photos that are decoded at a time; undistorted and reduced, each takes up to 24 bytes a pixel."""
 
@@ -164,11 +171,25 @@ def _decode(path: Path, mode: str) -> Image.Image:
 
 
 @contextmanager
-def opened_image(path: Path, what: str = "photo", remedy: str = "copy it there again") -> Iterator[Image.Image]:
-    """The file with its header read, as stored; `InputError` for whatever goes wrong with it while entered, and for a
-    TIFF that Pillow would turn, as it turns no other kind: cameras are by the pixels as they are stored."""
+def opened_image(
+    path: Path, what: str = "photo", remedy: str = "copy it there again", pixels: int = ALWAYS_PIXELS
+) -> Iterator[Image.Image]:
+    """The file with its header read, as stored; `InputError` for whatever goes wrong with it while entered, for more
+    pixels than its bytes may have, and for a TIFF that Pillow would turn, as it turns no other kind: cameras are by the
+    pixels as they are stored.
+
+    Args:
+        pixels: number that the image may have whatever the file's bytes.
+    """
+    other = OTHER_FORMATS.get(path.suffix.lower())
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=(*FORMATS, other) if other else FORMATS) as image:
+            stored = path.stat().st_size
+            if image.width * image.height > max(pixels, PIXELS_A_BYTE * stored):
+                raise InputError(
+                    f"{what} {path} has {image.width}x{image.height} pixels in {stored} bytes, which no {what} has: "
+                    "replace it or take it out"
+                )
             if image.format == "TIFF" and image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
                 raise InputError(
                     f"{what} {path} is a TIFF with an orientation in its EXIF data: take that out, or save it upright "

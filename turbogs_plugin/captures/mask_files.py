@@ -32,6 +32,9 @@ FOLDER = "masks"
 CONVENTIONS = "NAME.png, NAME.EXTENSION.png or NAME.jpg"
 FORMS = ["{stem}.png", "{name}.png", "{name}.mask.png", "{stem}_mask.png", "{name}", "{stem}.jpg", "{stem}.jpeg"]
 """Names of masks in their folder, in any letters, the first that is there before others."""
+MASK_PIXELS = 16
+"""Pixels of a mask for each of its photo, at most: where the photo is reduced, the mask need not be. An even mask is a
+file of few bytes."""
 HALF = 128
 """Value from which a pixel of a JPEG counts, whose compression leaves no exact zeros."""
 
@@ -129,7 +132,7 @@ def load_masks(
 
 def _read(file: Path, photo: Path, size: tuple[int, int], full_size: tuple[int, int]) -> np.ndarray:
     """[height, width] bool: the mask, in the size of the photo."""
-    with opened_image(file, "mask") as image:
+    with opened_image(file, "mask", pixels=MASK_PIXELS * size[0] * size[1]) as image:
         require_mask_size(file, image.size, photo, size, full_size)
         if image.mode == "P":
             image = image.convert("RGBA" if is_transparent(image) else "RGB")

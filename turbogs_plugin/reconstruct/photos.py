@@ -23,8 +23,6 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import naming
 
 SEPARATORS = re.compile(r"[\s#]")
-FORMATS = ("JPEG", "MPO", "PNG", "TIFF", "BMP")
-"""Image formats that COLMAP reads, by content. MPO: a phone's JPEG with a second picture appended."""
 PANORAMA = re.compile(rb"GPano:ProjectionType\s*(=\s*[\"']|>)\s*(equirectangular|cylindrical|cubemap)", re.IGNORECASE)
 KEPT_EXIF = (Base.Make, Base.Model, IFD.Exif, IFD.GPSInfo)
 """EXIF entries that copies which are turned upright keep: what COLMAP reads."""
@@ -130,7 +128,8 @@ def place_masks(folder: Path, place: Path, photos: Sequence[PhotoFile], target: 
         path = find(photo.path.relative_to(place).as_posix())
         if path is None:
             return
-        with opened_image(path, "mask") as mask, opened_image(photo.path) as image:
+        pixels = photo.size[0] * photo.size[1]
+        with opened_image(path, "mask", pixels=pixels) as mask, opened_image(photo.path) as image:
             require_mask_size(path, mask.size, photo.path, photo.size, image.size)
             inside = path.relative_to(next(each for each in (*folders, place) if each in path.parents))
             file = target / plain_name(inside)
@@ -156,8 +155,6 @@ def link_or_copy(source: Path, target: Path) -> None:
 def _read(path: Path, name: str) -> PhotoFile:
     with opened_image(path, remedy="replace it or take it out") as image:
         size, exif = image.size, image.getexif()
-        if image.format not in FORMATS:
-            raise InputError(f"photo {path} has {image.format} inside, which COLMAP does not read: convert it to JPEG")
         require_8_bits(image, path)
         xmp = [image.info.get(key, b"") for key in ("xmp", "XML:com.adobe.xmp")]
         if any(PANORAMA.search(text if isinstance(text, bytes) else text.encode()) for text in xmp):
