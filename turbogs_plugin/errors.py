@@ -10,6 +10,9 @@ import signal
 import sys
 from collections.abc import Callable, Iterable
 
+LONGEST_LINE = 1200
+"""Letters of an error's line: names and values of a file may have any number of them."""
+
 
 class InputError(ValueError):
     """Bad input: one line that names the thing and the remedy.
@@ -66,7 +69,8 @@ def error_line(error: Exception) -> str:
     if isinstance(error, OSError):
         place = "the system says" if error.filename is None else f"'{error.filename}'"
         said = f"{place}: {refusal(error)}"
-    return f"turbogs: error: {' '.join(said.split())}"
+    said = " ".join(said.split())
+    return f"turbogs: error: {said if len(said) <= LONGEST_LINE else f'{said[:800]} ... {said[-400:]}'}"
 
 
 def exit_code(command: Callable[[], int]) -> int:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.yaml_json import JSON_LIMIT
 
 PAUSE = 0.02
 """Seconds between two times that a large file is brought to the disk while it is written."""
@@ -50,13 +51,20 @@ def require_new_file(path: Path, option: str) -> None:
 
 
 def read_text(path: Path) -> str | None:
-    """The UTF-8 text of a file, or None where there is none. Raises `InputError` where it cannot be read."""
+    """The UTF-8 text of a file, or None where there is none. Raises `InputError` where it cannot be read, or is longer
+    than `JSON_LIMIT`."""
+    if path.exists() and not path.is_file():
+        raise InputError(f"cannot read '{path}': it is no file")
     try:
-        return path.read_text(encoding="utf-8")
+        with open(path, "rb") as file:
+            text = file.read(JSON_LIMIT + 1).decode("utf-8")
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read '{path}': {error}") from None
+    if len(text) > JSON_LIMIT:
+        raise InputError(f"cannot read '{path}': it has more than {JSON_LIMIT >> 20} MiB")
+    return text
 
 
 @contextmanager

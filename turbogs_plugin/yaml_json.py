@@ -23,8 +23,8 @@ SIZE_LIMIT = 64 * 1024
 DEPTH_LIMIT = 16
 """Levels of nesting, well above what any configuration has."""
 
-JSON_LIMIT = 256 * 2**20
-"""Bytes of a JSON text. A photo of a transforms.json takes about one thousand."""
+JSON_LIMIT = 64 * 2**20
+"""Characters of a JSON text. A photo of a transforms.json takes about one thousand."""
 
 FLOAT = re.compile(
     r"""[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?  # 0.25, 1e-4, .5
@@ -47,6 +47,15 @@ class _Loader(yaml.SafeLoader):
         if len(result) < len(node.value):
             raise yaml.constructor.ConstructorError(None, None, "a key is there twice", node.start_mark)
         return result
+
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        value = super().construct_yaml_int(node)
+        if abs(value) >> 63:  # no float, nor text, has room for any number
+            raise yaml.constructor.ConstructorError(None, None, "a whole number of more than 63 bits", node.start_mark)
+        return value
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -123,7 +132,7 @@ def _parsed(text: str, where: str) -> dict[str, Any]:
         return yaml.load(text, _Loader)
     except InputError:
         raise
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: a whole number of more digits than Python converts
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two: digits that Python does not convert
         mark = error.problem_mark if isinstance(error, yaml.MarkedYAMLError) else None
         problem = error.problem if isinstance(error, yaml.MarkedYAMLError) else str(error).splitlines()[0]
         place = f" (line {mark.line + 1})" if mark else ""
@@ -155,6 +164,11 @@ def yaml_text(mapping: dict[str, Any]) -> str:
     return yaml.dump(mapping, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
+def _whole(digits: str) -> int | float:
+    """A number without a point; a float where it has more digits than 63 bits."""
+    return int(digits) if len(digits) < 19 else float(digits)
+
+
 def parse_json(text: str, where: str) -> Any:
     """The value in a JSON text.
 
@@ -162,11 +176,11 @@ def parse_json(text: str, where: str) -> Any:
         where: what the text is, for messages: ``'transforms.json'``.
 
     Raises:
-        InputError: larger than `JSON_LIMIT`, not JSON, or nested more deeply than Python's parser follows.
+        InputError: longer than `JSON_LIMIT`, not JSON, or nested more deeply than Python's parser follows.
     """
     if len(text) > JSON_LIMIT:
-        raise InputError(f"{where} has more than {JSON_LIMIT} bytes")
+        raise InputError(f"{where} has more than {JSON_LIMIT >> 20} MiB: take out what is not needed")
     try:
-        return json.loads(text)
+        return json.loads(text, parse_int=_whole)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where} is not valid JSON: {error}") from None

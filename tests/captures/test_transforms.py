@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.bounded_memory import outcome_within
 from helpers.captures import TARGET, camera_to_world, write_transforms
 from helpers.refusals import assert_refused
 
 from turbogs_plugin.captures import load_scene
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.ply import read_colors
 
 
@@ -167,6 +169,13 @@ def test_frames_to_test_on(tmp_path):
         (lambda content: content.pop("fl_x"), "neither fl_x nor a camera_angle_x"),
         (lambda content: content.update(w=2**60), "camera of f0.png is .*: write the photo's size as w and h"),
         (lambda content: content.update(frames=3), "no list of frames"),
+        (
+            lambda content: content.update(
+                {key: 3000 * content[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}, k1=0.01
+            ),
+            "f0.png is .*, too small to be undistorted by a camera of ",
+        ),
+        (lambda content: content["frames"][1].update(file_path="/a" * 5000), "an image name has 10000 letters: rename"),
         (lambda content: content["frames"][0].pop("file_path"), "a frame without a file_path"),
         (
             lambda content: [frame.update(file_path=f"none{i}.png") for i, frame in enumerate(content["frames"][2:])],
@@ -182,6 +191,15 @@ def test_what_is_refused(tmp_path, change, words):
     folder = write_transforms(tmp_path / "cup")
     edit(folder, change)
     assert_refused(words, load_scene, folder)
+
+
+def test_what_a_file_says_is_not_said_again_for_each_frame(tmp_path):
+    folder = write_transforms(tmp_path / "cup")
+    edit(
+        folder,
+        lambda content: content.update(dict.fromkeys(map(str, range(3000)), 0), frames=[{"file_path": ""}] * 9000),
+    )
+    assert isinstance(outcome_within(64 << 20, load_scene, folder), InputError)
 
 
 @pytest.mark.parametrize(

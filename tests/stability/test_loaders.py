@@ -7,9 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import gzip
+import io
+import pickle
 import random
 import shutil
+import struct
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,9 +27,11 @@ from PIL import Image
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.spz import HEADER, MAGIC, VERSION
 from turbogs_plugin.train import inputs, run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
-from turbogs_plugin.train.saved_model import load_model
+from turbogs_plugin.train.saved_model import load_model, read_given
+from turbogs_plugin.types import PARAMETER_NAMES
 
 MEMORY = 64 * 2**20
 """Python and numpy may allocate this much for files of less than a megabyte."""
@@ -93,11 +101,14 @@ def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
     assert cases > 50 and refused > 0.6 * cases
 
 
+NUMBERS = {"0x": "f" * 20_000, "1:": "59:" * 15_000 + "59", "2:": "59:" * 15_000 + "59.5", "9": "9" * 5000}
+"""Beginnings and digits of numbers of YAML that no float has room for, nor a line's text."""
 BOMBS = {
     "aliases": "a: &a [x]\n" + "".join(f"b{i}: &b{i} [*a, *a]\n" for i in range(50)),
     "tag": "a: !!python/object/apply:os.system ['true']",
     "depth": "a: " + "{a: " * 5000 + "1" + "}" * 5000,
     "width": "a: [" + "1," * 100_000 + "1]",
+    **{f"number {kind}": f"train: {{epochs: {kind}{digits}}}" for kind, digits in NUMBERS.items()},
     "interpolation": "a: ${oc.env:HOME}\nb: ${a}${a}",
     "control characters": "a: \x00\x07",
 }
@@ -107,6 +118,54 @@ BOMBS = {
 def test_yaml_bombs(tmp_path, name):
     (tmp_path / "bomb.yaml").write_text(BOMBS[name])
     assert isinstance(outcome_within(MEMORY, load_config, str(tmp_path / "bomb.yaml")), InputError)
+
+
+def archived(values: bytes) -> bytes:
+    """A file of `torch.save` with these pickled values."""
+    with zipfile.ZipFile(file := io.BytesIO(), "w") as archive:
+        archive.writestr("a/data.pkl", values)
+        archive.writestr("a/version", "3")
+    return file.getvalue()
+
+
+def doubled(kind: type) -> Any:
+    """A value of 2^24 leaves, of a few objects."""
+    value = kind([0])
+    for _ in range(24):
+        value = kind([value, value])
+    return value
+
+
+def meta() -> bytes:
+    torch.save({"splats": dict.fromkeys(PARAMETER_NAMES, torch.zeros(5, 3, device="meta"))}, file := io.BytesIO())
+    return file.getvalue()
+
+
+def spz(count: int, degree: int) -> bytes:
+    header = HEADER.pack(MAGIC, VERSION, count, degree, 12, 0, 0)
+    return gzip.compress(header + bytes(count * (20 + 3 * ((degree + 1) ** 2 - 1))), 9)
+
+
+def called(name: str, bytes_: int) -> bytes:
+    return archived(b"\x80\x02c" + name.encode() + b"\n\x8a\x08" + struct.pack("<q", bytes_) + b"\x85R.")
+
+
+MODEL_BOMBS = {
+    "lists of lists.pt": lambda: archived(pickle.dumps({"splats": doubled(list)}, 2)),
+    "tuples of tuples.pt": lambda: archived(pickle.dumps({"splats": doubled(tuple)}, 2)),
+    "a key of tuples.pt": lambda: archived(b"\x80\x02}" + pickle.dumps(doubled(tuple), 2)[2:-1] + b"K\x01s."),
+    "bytes that are made.pt": lambda: called("builtins\nbytearray", 2**28),
+    "a storage that is made.pt": lambda: called("torch.storage\nUntypedStorage", 2**28),
+    "tensors that are nowhere.pt": meta,
+    "degree 3.spz": lambda: spz(200_000, 3),
+    "degree 0.spz": lambda: spz(500_000, 0),
+}
+
+
+@pytest.mark.parametrize("name", MODEL_BOMBS)
+def test_small_models_do_not_grow(tmp_path, name):
+    (tmp_path / name).write_bytes(MODEL_BOMBS[name]())
+    assert isinstance(outcome_within(MEMORY, read_given, tmp_path / name), InputError)
 
 
 @pytest.mark.parametrize("kind", ["one byte", "cut", "other size", "text", "empty", "damaged"])

@@ -14,12 +14,16 @@ from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.captures.decoding import photo_size
 from turbogs_plugin.captures.undistort import Lens, lens_of_camera
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import read_text
 from turbogs_plugin.scene.geometry import viewmat_of_pose
 from turbogs_plugin.yaml_json import parse_json
 
 BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 """Names of one model, whose missing coefficients are 0."""
 FISHEYE = "OPENCV_FISHEYE"
+FOR_ALL = ("camera_model", "is_fisheye", "w", "h", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "mask_path")
+FOR_ALL += ("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
+"""Keys of a file that hold for each frame without a value of its own."""
 
 
 def read_frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[dict[str, Any]]]:

@@ -20,6 +20,9 @@ FEWEST_PHOTOS = 3
 LARGEST_SIDE = 65535
 """Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
 
+LONGEST_NAME = 4096
+"""Most letters of a photo's name."""
+
 AGAIN = "export or reconstruct it again"
 
 
@@ -152,6 +155,8 @@ def named(names: Sequence[str], most: int = 3) -> str:
 
 
 def require_printable(name: str, source: Path) -> None:
-    """Raise `InputError` where a photo's name cannot be printed; `source` names it."""
+    """Raise `InputError` where a photo's name cannot be printed, or is longer than a path; `source` names it."""
+    if len(name) > LONGEST_NAME:
+        raise InputError(f"{source}: an image name has {len(name)} letters: rename the photo")
     if not name.isprintable():
         raise InputError(f"{source}: image name {name!r} has signs that cannot be printed: rename the photo")

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture
-from turbogs_plugin.captures.decoding import channels_of, load_photos, photo_sizes, reduced_sizes
+from turbogs_plugin.captures.decoding import ALWAYS_PIXELS, channels_of, load_photos, photo_sizes, reduced_sizes
 from turbogs_plugin.captures.kinds import read_capture
 from turbogs_plugin.captures.mask_files import find_masks, load_masks
 from turbogs_plugin.captures.photo_files import IMAGES
@@ -28,6 +28,8 @@ from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.scene.scene import PosedImages, Scene
 from turbogs_plugin.types import Cameras
 
+LENS_PIXELS = 16
+"""Pixels of a lens's camera for each of the photo that is undistorted in the camera's size, at most."""
 FARTHEST = 1e15
 """Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
 
@@ -209,6 +211,13 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
     paths = [capture.photo_folder / name for name in capture.names]
     sizes = photo_sizes(paths)
     note = _require_scaled(paths, sizes, capture.photo_sizes)
+    grown = capture.photo_sizes.prod(axis=1) > np.maximum(ALWAYS_PIXELS, LENS_PIXELS * sizes.prod(axis=1))
+    if bent := [view for view in np.flatnonzero(grown) if capture.lenses[view] is not None]:
+        (width, height), camera = sizes[bent[0]].tolist(), "x".join(map(str, capture.photo_sizes[bent[0]].tolist()))
+        raise InputError(
+            f"photo {paths[bent[0]]} is {width}x{height}, too small to be undistorted by a camera of {camera}: use the "
+            "photos that the cameras were reconstructed from"
+        )
     reduction = re.fullmatch(rf"{IMAGES}_(\d+)", capture.photo_folder.name)
     smaller = capture.photo_sizes[0, 0] > 1.5 * sizes[0, 0]
     already = int(reduction[1]) if reduction and smaller else 1

@@ -49,6 +49,8 @@ MAPS_OF = (rf"(.+?)[._ -]?(?:{_MAPS}|alpha)(?:[_-]?\d+)?", rf"(?:dynamic_)?{_MAP
 PHOTO_DEPTH = 1
 """Photos are looked for in a folder and in the folders in it. The photos of several captures beside each other lie
 deeper, in the ``images`` of each."""
+DEEPEST = 16
+"""Folders of a name that are looked at, the last ones."""
 FOLDER_DEPTH = 4
 """Named photos are looked for in folders of a capture, no deeper than this."""
 IMAGES, REDUCED = "images", tuple(f"images_{factor}" for factor in (2, 4, 8, 16))
@@ -124,17 +126,19 @@ def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | 
         InputError: a name that cannot be printed.
     """
     require_printable(name, source)
-    return next((form for form in _forms(name, folder) if (scene / form).is_file()), None)
+    return next((form for form in _forms(name, folder) if os.path.isfile(f"{scene}/{form}")), None)
 
 
 def _forms(name: str, folder: str) -> list[str]:
     """The paths in a scene that a name may mean in a folder: the name there; of a path of the machine that wrote it,
-    absolute or with '..', each of its ends, the longest first. Separators may be Windows' ones. A copy of
+    absolute or with '..', each of its ends of `DEEPEST` parts and fewer, the longest first. Separators may be Windows' ones. A copy of
     ``images/a.png`` is ``images_2/a.png``."""
     path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
     parts = path.parts[bool(path.anchor) or (folder in REDUCED and path.parts[:1] == (IMAGES,)) :]
-    starts = range(len(parts) if path.anchor or ".." in parts else min(1, len(parts)))
-    return [PurePosixPath(folder, *parts[start:]).as_posix() for start in starts if ".." not in parts[start:]]
+    parts = (folder, *parts[-DEEPEST:]) if folder else parts[-DEEPEST:]
+    first, elsewhere = bool(folder), path.anchor or ".." in parts
+    starts = range(first, len(parts) if elsewhere else min(first + 1, len(parts)))
+    return ["/".join((*parts[:first], *parts[start:])) for start in starts if ".." not in parts[start:]]
 
 
 class FoundPhotos(NamedTuple):
@@ -167,7 +171,7 @@ def find_named(
         InputError: a name that cannot be printed, a photo that is named twice, or fewer than `FEWEST_PHOTOS` photos.
     """
     found: list[str | None] = []
-    for places in (folders, *([folder] for folder in REDUCED)):
+    for places in (folders, *([folder] for folder in REDUCED if (scene / folder).is_dir())):
         here = [
             next(filter(None, (file_named(scene, name, source, place) for place in places)), None) for name in names
         ]
@@ -250,8 +254,10 @@ def files_below(folder: Path, without: re.Pattern | None = None) -> Iterator[Pur
 
 def _beside(index: Index, name: str, folders: Sequence[str]) -> list[PurePosixPath]:
     """The files of a name's stem in a folder that the name says."""
+    if not (files := index.get(_stem(name))):
+        return []
     places = {PurePosixPath(form).parent for folder in folders for form in _forms(name, folder)}
-    return [file for file in index.get(_stem(name), ()) if file.parent in places]
+    return [file for file in files if file.parent in places]
 
 
 def _best(files: Sequence[PurePosixPath], name: str) -> str:

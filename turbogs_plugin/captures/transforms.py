@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from turbogs_plugin.captures.camera_json import opengl_viewmat, read_camera, read_frames
+from turbogs_plugin.captures.camera_json import FOR_ALL, opengl_viewmat, read_camera, read_frames
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture
 from turbogs_plugin.captures.photo_files import file_named, find_named
 from turbogs_plugin.captures.starting_points import GREY, clouds_beside, read_cloud
@@ -74,7 +74,8 @@ def _frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[Fra
     content, frames = read_frames(source, key)
     if not all(isinstance(frame.get("file_path"), str) for frame in frames):
         raise InputError(f"{source} has a frame without a file_path: export it again")
-    return content, [{**content, **frame} for frame in frames]
+    shared = {key: content[key] for key in FOR_ALL if key in content}
+    return content, [{**shared, **frame} for frame in frames]
 
 
 def _written(frame: Frame) -> str:

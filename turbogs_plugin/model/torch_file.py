@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import pickletools
+import re
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,13 +17,21 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.scene.host_arrays import too_large
 
+PLAIN = re.compile(
+    r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|"
+    r"torch (\w+Storage|Size|device|float\d+|bfloat16|u?int\d+|bool)"
+)
+"""Names that a file may call. torch allows others besides, some of which take any amount of memory."""
+
 
 def read_plain(path: Path, name: str, remedy: str = "") -> Any:
     """What a file of `torch.save` holds, on the CPU.
 
-    Only plain tensors and values are read (``weights_only``). They must be uncompressed and no larger than the file. So
-    a file from an untrusted source can neither run code nor fill the memory. One that is large beside the free memory
-    stays on the disk, from where tensors are read as they are used; its checksums are not looked at.
+    Only plain tensors and values are read (``weights_only``), by the names of `PLAIN`. They must be uncompressed, no
+    larger than the file, and in the host's memory, and no tuple may stand in several places. So a file from an
+    untrusted source can neither run code nor take more memory than some 100 bytes for each of its own, nor work without
+    end. One that is large beside the free memory stays on the disk, from where tensors are read as they are used; its
+    checksums are not looked at.
 
     Args:
         name: of the file, for messages.
@@ -33,9 +43,9 @@ def read_plain(path: Path, name: str, remedy: str = "") -> Any:
     try:
         _require_bounded(path)
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=too_large(os.path.getsize(path)))
-        tensors = [value for _, value in leaves(state, "state") if isinstance(value, Tensor)]
-        if any(tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes() for tensor in tensors):
-            raise ValueError("it has a tensor that is not stored whole")
+        for tensor in _tensors(state):
+            if tensor.device.type != "cpu" or tensor.nbytes > tensor.untyped_storage().nbytes():
+                raise ValueError("it has a tensor that is not stored whole")
         return state
     except OSError as error:
         raise InputError(f"cannot read {name}: {error.strerror or error}") from None
@@ -79,11 +89,44 @@ def leaves(value: Any, place: str) -> Iterator[tuple[str, Any]]:
         yield place, value
 
 
+def _tensors(state: Any) -> Iterator[Tensor]:
+    """The tensors in nested dicts, lists and tuples, each object of which is looked at once."""
+    left, seen = [state], {id(state)}
+    while left:
+        value = left.pop()
+        if isinstance(value, Tensor):
+            yield value
+        inner = [*value.values()] if isinstance(value, dict) else value if isinstance(value, list | tuple) else []
+        left += [item for item in inner if id(item) not in seen]
+        seen.update(map(id, inner))
+
+
 def _require_bounded(path: Path) -> None:
-    """Refuse archives that unpack to more than their size."""
+    """Refuse archives that unpack to more than their size, or whose values do (`_require_plain`)."""
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
-    if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-        raise ValueError("its entries are compressed")
-    if sum(entry.file_size for entry in entries) > os.path.getsize(path):
-        raise ValueError("its entries overlap")
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            raise ValueError("its entries are compressed")
+        if sum(entry.file_size for entry in entries) > os.path.getsize(path):
+            raise ValueError("its entries overlap")
+        names = [entry.filename.lower() for entry in entries]  # torch does not tell capitals from small letters
+        if len({*names}) < len(names):
+            raise ValueError("it has two entries of one name")
+        for entry in entries:
+            if entry.filename.lower().endswith(".pkl"):
+                _require_plain(archive.read(entry))
+
+
+def _require_plain(pickled: bytes) -> None:
+    """Refuse values that call other names than those of `PLAIN`, and tuples in several places: nested, they are keys
+    whose hash takes endless time, and values that no walk comes to the end of."""
+    tuples, made = set(), ""
+    for code, argument, _ in pickletools.genops(pickled):
+        if code.name == "GLOBAL" and not PLAIN.fullmatch(str(argument)):
+            raise ValueError(f"it holds more than plain tensors and values: {str(argument)[:60]}")
+        if code.name in ("BINPUT", "LONG_BINPUT"):
+            (tuples.add if made.startswith("TUPLE") else tuples.discard)(argument)
+        elif code.name in ("BINGET", "LONG_BINGET") and argument in tuples:
+            raise ValueError("it has one tuple in several places")
+        else:
+            made = code.name

@@ -22,6 +22,7 @@ from turbogs_plugin.reconstruct import solver
 from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups, ghost_pairs
 from turbogs_plugin.reconstruct.matching import FEW, choose_pairs
 from turbogs_plugin.reconstruct.photos import PhotoFile, place_masks, place_photos, read_photos
+from turbogs_plugin.yaml_json import parse_json
 
 if TYPE_CHECKING:
     import pycolmap
@@ -163,7 +164,10 @@ def _read_solution(out: Path) -> Solution | None:
     text = read_text(out / "reconstruction" / "solution.json")
     if not text or not (out / "sparse" / "0").is_dir():
         return None
-    return Solution(**json.loads(text) | {"scene": out})  # which may have been moved
+    try:
+        return Solution(**parse_json(text, "it") | {"scene": out})  # which may have been moved
+    except (InputError, TypeError) as error:
+        raise InputError(f"'{out}/reconstruction/solution.json' is no record of cameras ({error}): remove it") from None
 
 
 def _reconstruct(photos: Sequence[PhotoFile], out: Path, others: str) -> Solution:

@@ -19,10 +19,11 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.files import read_text, write_text_atomically
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.study.grid import Ablation, CellKey
 from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.yaml_json import parse_json
 
 FORMAT = 3
 """Version of ``results.json``: raised whenever an older version of TurboGS would misread a new file."""
@@ -235,10 +236,7 @@ def _rounded(name: str, value: float) -> float | None:
 
 def _parsed(path: Path) -> Study:
     """Study of a file that `_text` made."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot read '{path}': {error}") from None
+    document = parse_json(read_text(path) or "", f"'{path}'")
     try:
         if document["format"] != FORMAT:
             raise InputError(f"'{path}' is of format {document['format']}: this version reads format {FORMAT}")

@@ -5,13 +5,13 @@ A command makes its wall clock before it loads torch, so this module does withou
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text
+from turbogs_plugin.yaml_json import parse_json
 
 
 class WallClock:
@@ -57,7 +57,7 @@ class WallRecord:
         """The record of a run, or None where it has none. Raises `InputError` if the file is not one."""
         text = read_text(path)
         try:
-            return None if text is None else WallRecord(**json.loads(text))
+            return None if text is None else WallRecord(**parse_json(text, str(path)))
         except (ValueError, TypeError):
             raise InputError(f"'{path}' is not a record of the wall clock: remove it") from None
 

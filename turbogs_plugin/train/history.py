@@ -10,6 +10,7 @@ from typing import Any
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import naming, read_text, write_text_atomically
+from turbogs_plugin.yaml_json import parse_json
 
 MEASURES = ("psnr", "ssim", "l1")
 """The errors that every comparison of a render with a photo gives."""
@@ -90,8 +91,10 @@ def read_history(path: Path) -> list[Evaluation]:
         if number == len(lines) and not line.endswith("}"):
             break
         try:
-            found = json.loads(line).items()
+            found = parse_json(line, "it").items()
             values: dict[str, Any] = {name: math.nan if value is None else value for name, value in found}
+            if not all(isinstance(value, int | float) for value in values.values()):
+                raise TypeError("not a number")
             evaluations.append(Evaluation(**values))
         except (ValueError, TypeError, AttributeError):
             raise InputError(f"'{path}' line {number} is not an evaluation: take that line out") from None
