@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -140,16 +140,17 @@ def train(
     with _fitting(scene):
         loop = new_loop(_independent(plan.apply(config), device), scene, device, ranks)
         session = RunSession(folder, scene, loop, clock)
-    if ranks.first:
-        resolved = loop.trainer.config
-        print("\n".join([*scene.notes, plan.text()]), file=sys.stderr)
-        if resolved.budget.time:
-            print(f"{resolved.budget.time} of training: about {resolved.train.iterations} iterations", file=sys.stderr)
-        folder.path.mkdir(parents=True, exist_ok=True)
-        write_text_atomically(folder.plan, plan.text() + "\n")
-        write_text_atomically(folder.asked, config.to_yaml())
-        write_text_atomically(folder.config, resolved.to_yaml())
-    return session.run(report, watch)
+    with folder.owned(new=True) if ranks.first else nullcontext():
+        if ranks.first:
+            resolved = loop.trainer.config
+            print("\n".join([*scene.notes, plan.text()]), file=sys.stderr)
+            if resolved.budget.time:
+                length = f"about {resolved.train.iterations} iterations"
+                print(f"{resolved.budget.time} of training: {length}", file=sys.stderr)
+            write_text_atomically(folder.plan, plan.text() + "\n")
+            write_text_atomically(folder.asked, config.to_yaml())
+            write_text_atomically(folder.config, resolved.to_yaml())
+        return session.run(report, watch)
 
 
 def resume(
@@ -178,11 +179,19 @@ def resume(
     folder = RunFolder(path)
     config = folder.read_config(True, trusted)
     require_device(config.train.device)
+    require_writable(folder.path, f"what --resume {folder.path} writes")
+    with folder.owned() if ranks.first else nullcontext():
+        return _resumed(folder, config, clock, ranks).run(report, watch)
+
+
+def _resumed(folder: RunFolder, config: Config, clock: WallClock, ranks: Ranks) -> RunSession:
+    """The session of a run as its newest checkpoint has it. Errors as of `resume`."""
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None and folder.model.is_file():
-        raise InputError(f"'{path}' is finished and has no checkpoint to go on from: use its {folder.model.name}")
+        raise InputError(
+            f"'{folder.path}' is finished and has no checkpoint to go on from: use its {folder.model.name}"
+        )
     state = None if checkpoint is None else load_checkpoint(checkpoint)
-    require_writable(folder.path, f"what --resume {folder.path} writes")
     scene, device = open_started(config, clock, ranks, trained=True)
     hold_to_limit(config, device)
     with _fitting(scene):
@@ -193,7 +202,7 @@ def resume(
             session.load_state_dict(state, str(checkpoint))
     if ranks.first:
         session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
-    return session.run(report, watch)
+    return session
 
 
 def _posed_capture(config: Config, out: Path) -> str:

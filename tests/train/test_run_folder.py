@@ -1,0 +1,78 @@
+"""One owner of a run's folder."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+from helpers.framework_runs import tiny_config
+from helpers.refusals import assert_refused
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.train import run
+from turbogs_plugin.train.run_files import RunFolder
+
+HOLDING = """
+import sys, time
+from pathlib import Path
+from turbogs_plugin.train.run_files import RunFolder
+with RunFolder(Path(sys.argv[1])).owned(new=True):
+    print("held", flush=True)
+    time.sleep(100)
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """A process that writes to the run `tmp_path / "run"`."""
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDING, tmp_path / "run"], stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout.readline() == "held\n"
+        yield other
+        other.kill()
+
+
+def test_a_folder_has_one_owner_and_a_dead_one_has_none(holder, tmp_path, capsys):
+    folder = RunFolder(tmp_path / "run")
+    for new in (False, True):
+        with (
+            pytest.raises(InputError, match=f"process {holder.pid} of .* writes to .*: wait"),
+            folder.owned(new),
+        ):
+            pytest.fail("two own it")
+    holder.send_signal(signal.SIGKILL)
+    holder.wait()
+    with folder.owned(new=True):
+        assert f"process {holder.pid} of " in capsys.readouterr().err
+    with folder.owned():  # left by its owner
+        assert not capsys.readouterr().err
+    assert [file.name for file in folder.path.iterdir()] == [folder.lock.name]
+
+
+def test_a_run_and_its_resume_are_refused_while_another_writes(holder, capture, tmp_path, monkeypatch):
+    folder = RunFolder(tmp_path / "run")
+    monkeypatch.setattr(RunFolder, "require_new", lambda folder: None)  # both began at once
+    config = tiny_config(capture, "train.iterations=2")
+    assert_refused("writes to", run.train, config, folder.path)
+    folder.config.write_text(config.without_plan().to_yaml())
+    before = sorted(folder.path.iterdir())
+    assert_refused("writes to", run.resume, folder.path)
+    assert sorted(folder.path.iterdir()) == before
+
+
+def test_a_new_folder_that_another_has_written_to_is_refused(tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.path.mkdir()
+    folder.model.touch()
+    with pytest.raises(InputError, match="not empty"), folder.owned(new=True):
+        pytest.fail("two own it")
+
+
+def test_a_lock_that_is_a_link_is_refused(tmp_path):
+    folder, victim = RunFolder(tmp_path), tmp_path / "victim"
+    victim.write_text("mine")
+    folder.lock.symlink_to(victim)
+    with pytest.raises(InputError, match="is a link: remove it"), folder.owned():
+        pytest.fail("it was followed")
+    assert victim.read_text() == "mine"
