@@ -6,6 +6,7 @@ from __future__ import annotations
 import glob
 import itertools
 import os
+import secrets
 import socket
 import tempfile
 import threading
@@ -80,7 +81,8 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object], large: bool = False) -> None:
-    """Write a file beside its destination, bring it to the disk, and put it in place by one rename.
+    """Write a new file of a random name beside its destination, bring it to the disk, and put it in place by one
+    rename, which replaces a link and follows none.
 
     Whatever interrupts this (a full disk, a kill), `path` is what it was before or is complete. Several processes may
     write the same file: one of the writes stays. A write first removes what a killed process of this host has left.
@@ -93,13 +95,14 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object], large: boo
     Raises:
         OSError: from the disk, with the name of the file; then nothing is left behind.
     """
-    for leftover in path.parent.glob(f"{glob.escape(_own_prefix(path))}*.part"):
-        writer = leftover.suffixes[-2].lstrip(".")
+    prefix = f".{path.name}.{socket.gethostname()}."  # of the partial files that this host writes
+    for leftover in path.parent.glob(f"{glob.escape(prefix)}*.part"):
+        writer = leftover.name.removeprefix(prefix).partition(".")[0]
         if not writer.isdecimal() or process_started(int(writer)) == "gone":
             leftover.unlink(missing_ok=True)
-    temporary = partial_path(path)
+    temporary = path.with_name(f"{prefix}{os.getpid()}.{secrets.token_hex(8)}.part")
     try:
-        with naming(path), open(temporary, "wb") as file:
+        with naming(path), open(temporary, "xb") as file:
             with _brought_to_disk(file) if large else nullcontext():
                 write(file)
             file.flush()
@@ -110,6 +113,12 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object], large: boo
         temporary.unlink(missing_ok=True)
         raise
     _sync_folder(path.parent)
+
+
+def new_file(path: Path) -> BinaryIO:
+    """A new file in the place of any file or link that is there, for pictures, which need not be whole."""
+    path.unlink(missing_ok=True)
+    return open(path, "xb")
 
 
 @contextmanager
@@ -134,16 +143,6 @@ def unused_name(name: str, taken: Container[str]) -> str:
     """The name, with a number behind it where that is taken."""
     names = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
     return next(name for name in names if name not in taken)
-
-
-def partial_path(path: Path) -> Path:
-    """Place where this process writes a file until it is complete."""
-    return path.with_name(f"{_own_prefix(path)}{os.getpid()}.part")
-
-
-def _own_prefix(path: Path) -> str:
-    """Beginning of the names of a file's partial files that this host writes."""
-    return f".{path.name}.{socket.gethostname()}."
 
 
 def write_text_atomically(path: Path, text: str) -> None:

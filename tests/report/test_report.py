@@ -14,7 +14,7 @@ import torch
 from helpers.framework_runs import tiny_capture, tiny_config
 from PIL import Image
 
-from turbogs_plugin.report import evaluation, provenance
+from turbogs_plugin.report import evaluation, images, provenance
 from turbogs_plugin.report.curves import plot_against_seconds
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, GAP, depth_picture, error_picture, save_image, strip
 from turbogs_plugin.report.run_report import write_report
@@ -48,13 +48,13 @@ def test_errors_have_the_colours_of_matplotlib():
     assert np.abs(picture.numpy() - expected).max() <= 6
 
 
-def test_pictures_are_written_in_the_format_of_their_suffix(tmp_path):
+def test_pictures_are_written_in_the_format_of_their_suffix(tmp_path, monkeypatch):
     pixels = np.linspace(0, 255, 24 * 40 * 3).astype(np.uint8).reshape(24, 40, 3)
     for name in ("a.png", "b.jpg"):
         save_image(tmp_path / name, pixels)
     assert (np.asarray(Image.open(tmp_path / "a.png")) == pixels).all()
     assert np.abs(np.asarray(Image.open(tmp_path / "b.jpg")).astype(int) - pixels).mean() < 2.0
-    (tmp_path / "full.png").symlink_to("/dev/full")
+    monkeypatch.setattr(images, "new_file", lambda path: open("/dev/full", "wb", 0))  # noqa: SIM115
     with pytest.raises(OSError) as failed:
         save_image(tmp_path / "full.png", np.repeat(pixels, 20, 0))
     assert failed.value.filename == str(tmp_path / "full.png"), "which a write does not know"
@@ -93,7 +93,9 @@ def test_the_commit_of_the_sources(tmp_path, monkeypatch):
 
 def test_tables():
     assert table(("a", "b"), [(1, 2)]).splitlines() == ["| a | b |", "| --- | --- |", "| 1 | 2 |"]
-    assert table(("a",), [("left|right.png",)]).splitlines()[-1] == "| left\\|right.png |"
+    name = "<img src=x onerror=alert(1)>![x](javascript:alert(4)) `c` left|right.png"
+    shown = r"\<img src=x onerror=alert(1)>!\[x\](javascript:alert(4)) \`c\` left\|right.png"
+    assert table(("a",), [(name,)]).splitlines()[-1] == f"| {shown} |"
     assert number(1.23456, 2) == "1.23" and number(math.nan, 2) == "not computed"
 
 

@@ -1,15 +1,22 @@
-"""One owner of a run's folder."""
+"""One owner of a run's folder, and files that are written there whatever links lie there."""
 
+import os
 import signal
+import socket
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from helpers.framework_runs import tiny_config
 from helpers.refusals import assert_refused
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.report.curves import plot_against_seconds
+from turbogs_plugin.report.images import save_image
 from turbogs_plugin.train import run
+from turbogs_plugin.train.history import Evaluation, append_evaluation
 from turbogs_plugin.train.run_files import RunFolder
 
 HOLDING = """
@@ -75,4 +82,30 @@ def test_a_lock_that_is_a_link_is_refused(tmp_path):
     folder.lock.symlink_to(victim)
     with pytest.raises(InputError, match="is a link: remove it"), folder.owned():
         pytest.fail("it was followed")
+    assert victim.read_text() == "mine"
+
+
+WRITERS = {
+    "text": lambda path: write_text_atomically(path, "new"),
+    "picture.png": lambda path: save_image(path, np.zeros((4, 4, 3), np.uint8)),
+    "plot.png": lambda path: plot_against_seconds(path, [0.0, 1.0], [1.0, 2.0], "label", "title"),
+    "history": lambda path: append_evaluation(path, Evaluation(**dict.fromkeys(NEEDED, 1))),
+}
+NEEDED = ("iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians")
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_no_link_is_followed(tmp_path, name):
+    """Neither one in the place of the file, nor one with a name that the partial file might have."""
+    victim, file = tmp_path / "victim", tmp_path / "run" / name
+    victim.write_text("mine")
+    file.parent.mkdir()
+    file.symlink_to(victim)
+    (file.parent / f".{name}.{socket.gethostname()}.{os.getpid()}.part").symlink_to(victim)
+    if name == "history":
+        with pytest.raises(OSError, match="symbolic"):
+            WRITERS[name](file)
+    else:
+        WRITERS[name](file)
+        assert not file.is_symlink() and file.stat().st_size
     assert victim.read_text() == "mine"

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.camera_path import from_file, orbit, through_views
-from turbogs_plugin.files import naming, require_new_file, require_writable, unused_name
+from turbogs_plugin.files import naming, new_file, require_new_file, require_writable, unused_name
 from turbogs_plugin.report.evaluation import open_saved, views_of
 from turbogs_plugin.report.images import depth_picture, save_image, to_uint8
 from turbogs_plugin.scene import Scene
@@ -74,8 +75,8 @@ def render_run(
         save_image(folders[0] / f"{name}.png", to_uint8(look.colors(image.colors, view_id)))
         if image.depths is not None:
             depths = (image.depths.cpu().double() * model.frame.scale).float().numpy()
-            with naming(folders[1] / f"{name}.npy"):
-                np.save(folders[1] / f"{name}.npy", depths)
+            with naming(folders[1] / f"{name}.npy"), new_file(folders[1] / f"{name}.npy") as file:
+                np.save(file, depths)
             save_image(folders[1] / f"{name}.png", depth_picture(depths))
     print("\n".join(scene.notes), file=sys.stderr)  # last, as an error is one line alone
     return folders
@@ -146,8 +147,8 @@ def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) 
 
     width, height = (cameras.sizes[0] // 2 * 2).tolist()
     cameras = cameras.to(gaussians.device)
-    # Its own suffix last, by which ffmpeg knows the container.
-    temporary = video.with_name(f".{video.stem}.part{video.suffix}")
+    hidden = tempfile.TemporaryDirectory(dir=video.parent, prefix=".")
+    temporary = Path(hidden.name) / video.name  # ffmpeg knows the container by the suffix
     options = {"fps": RATE, "codec": CODEC, "quality": QUALITY, "macro_block_size": 1, "ffmpeg_log_level": "error"}
     writer = imageio_ffmpeg.write_frames(str(temporary), (width, height), **options)
     try:
@@ -162,4 +163,4 @@ def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) 
         raise InputError(f"--out '{video}' cannot be encoded: {' '.join(str(error).split())[:200]}") from None
     finally:
         writer.close()
-        temporary.unlink(missing_ok=True)
+        hidden.cleanup()

@@ -8,8 +8,9 @@ import shutil
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from PIL import ImageOps
 from PIL.ExifTags import IFD, Base
@@ -20,7 +21,7 @@ from turbogs_plugin.captures.kinds import run_folder
 from turbogs_plugin.captures.mask_files import FOLDER, mask_finder, require_mask_size
 from turbogs_plugin.captures.photo_files import find_photos, unread
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import naming
+from turbogs_plugin.files import write_atomically
 
 SEPARATORS = re.compile(r"[\s#]")
 PANORAMA = re.compile(rb"GPano:ProjectionType\s*(=\s*[\"']|>)\s*(equirectangular|cylindrical|cubemap)", re.IGNORECASE)
@@ -96,14 +97,10 @@ def place_photos(photos: Sequence[PhotoFile], folder: Path) -> None:
         if target.exists():
             return
         target.parent.mkdir(parents=True, exist_ok=True)
-        part = target.with_name(f".{target.name}.part")
-        with naming(target):
-            part.unlink(missing_ok=True)
-            if photo.turned:
-                _write_upright(photo.path, part)
-            else:
-                link_or_copy(photo.path, part)
-            os.replace(part, target)
+        if photo.turned:
+            write_atomically(target, partial(_write_upright, photo.path))
+        else:
+            link_or_copy(photo.path, target)
 
     with decoding_threads() as pool:
         list(pool.map(place, photos))
@@ -137,7 +134,8 @@ def place_masks(folder: Path, place: Path, photos: Sequence[PhotoFile], target: 
             file.unlink(missing_ok=True)
             if photo.turned and mask.size == image.size:
                 mask.getexif()[Base.Orientation] = image.getexif()[Base.Orientation]
-                ImageOps.exif_transpose(mask).save(file, format=mask.format)
+                turned, form = ImageOps.exif_transpose(mask), mask.format
+                write_atomically(file, partial(turned.save, format=form))
             else:
                 link_or_copy(path, file)
 
@@ -146,10 +144,12 @@ def place_masks(folder: Path, place: Path, photos: Sequence[PhotoFile], target: 
 
 
 def link_or_copy(source: Path, target: Path) -> None:
+    """A whole new file `target`, which is not there. Raises `OSError`."""
     try:
         os.link(source.resolve(), target)
     except OSError:  # another disk, a file of another user
-        shutil.copyfile(source, target)
+        with open(source, "rb") as file:
+            write_atomically(target, lambda copy: shutil.copyfileobj(file, copy))
 
 
 def _read(path: Path, name: str) -> PhotoFile:
@@ -179,7 +179,7 @@ def _read(path: Path, name: str) -> PhotoFile:
     return PhotoFile(name, path, upright, turned, lens, (status.st_size, status.st_mtime_ns))
 
 
-def _write_upright(source: Path, target: Path) -> None:
+def _write_upright(source: Path, target: BinaryIO) -> None:
     """The photo as EXIF says that it is to be seen, with its camera, focal length and GPS."""
     with opened_image(source) as image:
         form = "JPEG" if image.format == "MPO" else image.format
@@ -194,4 +194,6 @@ def _write_upright(source: Path, target: Path) -> None:
     try:
         upright.save(target, format=form, exif=exif, **options)
     except Exception:  # Pillow cannot write all EXIF that it reads, and nothing in it is needed
+        target.seek(0)
+        target.truncate()
         upright.save(target, format=form, **options)

@@ -9,6 +9,8 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 
+from turbogs_plugin.files import new_file
+
 STYLE: dict[Any, Any] = {
     "figure.dpi": 120,
     "font.size": 11,
@@ -44,4 +46,5 @@ def plot_against_seconds(path: Path, seconds: Sequence[float], values: Sequence[
         axes.set(xlabel=SECONDS_LABEL, ylabel=label, title=title)
         axes.set_xlim(left=0)
         axes.margins(y=0.12)
-        figure.savefig(path)
+        with new_file(path) as file:
+            figure.savefig(file, format="png")

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from turbogs_plugin.files import naming
+from turbogs_plugin.files import naming, new_file
 
 ERROR_FULL_SCALE = 0.25
 """Mean absolute error over RGB at which an error map has its brightest colour."""
@@ -34,11 +34,11 @@ def save_image(path: Path, pixels: np.ndarray) -> None:
     Raises:
         OSError: it cannot be written; the error names the file.
     """
-    with naming(path):
+    with naming(path), new_file(path) as file:
         if path.suffix == ".jpg":
-            Image.fromarray(pixels).save(path, quality=JPEG_QUALITY, subsampling=0)
+            Image.fromarray(pixels).save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)
         else:
-            Image.fromarray(pixels).save(path)
+            Image.fromarray(pixels).save(file, "PNG")
 
 
 def strip(photo: Tensor, image: Tensor, mask: Tensor | None = None) -> Tensor:

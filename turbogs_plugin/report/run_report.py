@@ -13,7 +13,7 @@ from turbogs_plugin.files import read_text, write_text_atomically
 from turbogs_plugin.report.evaluation import load_lpips
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip
 from turbogs_plugin.report.provenance import hardware, software
-from turbogs_plugin.report.tables import ERRORS, error_columns, errors, history_rows, table, views_table
+from turbogs_plugin.report.tables import ERRORS, error_columns, errors, escaped, history_rows, table, views_table
 from turbogs_plugin.strategies.view_sampling import doubted
 from turbogs_plugin.train.metrics import Metrics, evaluate, render_view
 from turbogs_plugin.train.session import RunSession
@@ -104,18 +104,18 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int, doub
     lpips = f"\nLPIPS was not computed: {lpips_reason}.\n" if lpips_reason else ""
     history = table(("iteration", "training in s", *ERRORS.values(), "Gaussians", "peak memory in MiB"), rows)
     strips = "\n\n".join(
-        f"{view.name}: {view.psnr:.2f} dB\n\n![{view.name}](report/test-{view_id:03d}.jpg)"
+        f"{escaped(view.name)}: {view.psnr:.2f} dB\n\n![{escaped(view.name)}](report/test-{view_id:03d}.jpg)"
         for view_id, view in enumerate(metrics.views[:shown])
     )
     doubted_photos = "".join(
-        f"\n{run.trainer.views.names[view]}: {ratio:.1f} times the median error\n\n"
+        f"\n{escaped(run.trainer.views.names[view])}: {ratio:.1f} times the median error\n\n"
         f"![doubted](report/doubted-{view:03d}.jpg)\n"
         for view, ratio in doubts.items()
     )
     doubted_photos = doubted_photos and f"\n## Doubted photos\n{DOUBTED}\n{doubted_photos}"
     folder = shlex.quote(str(run.folder.path))
     exported = "[model.html](model.html)" if (run.folder.path / "model.html").is_file() else "`model.html`"
-    return f"""# {run.scene.name}
+    return f"""# {escaped(run.scene.name)}
 
 {last.iteration} iterations on {len(run.scene.train)} training views, seed {config.train.seed}; measured on
 {len(metrics.views)} test views.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 
 from turbogs_plugin.train.history import Evaluation
@@ -20,10 +21,15 @@ FURTHER = {f"{kind}_{name}": f"{head} {said}" for kind, said in FURTHER_KINDS.it
 """Measure of `FurtherErrors` -> head of its column."""
 
 
+def escaped(text: object) -> str:
+    """A text, the name of a photo or a capture, that Markdown shows as it is: no tag, link, code or end of a cell."""
+    return re.sub(r"[\\`<\[\]|]", r"\\\g<0>", str(text))
+
+
 def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A Markdown table. A bar in a cell, which would end it, is escaped."""
-    header = list(header)
-    lines = [header, ["---"] * len(header), *([str(cell).replace("|", "\\|") for cell in row] for row in rows)]
+    """A Markdown table, whose cells are `escaped`."""
+    header = [escaped(cell) for cell in header]
+    lines = [header, ["---"] * len(header), *([escaped(cell) for cell in row] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from turbogs_plugin.files import write_text_atomically
-from turbogs_plugin.report.tables import table
+from turbogs_plugin.report.tables import escaped, table
 from turbogs_plugin.study.results import Study, StudyFolder
 from turbogs_plugin.study.statistics import Difference, SceneSummary, Spread, VariantRow, summarise
 from turbogs_plugin.study.study_plots import PLOT, write_plot
@@ -59,10 +59,10 @@ def report_text(study: Study, summaries: Sequence[SceneSummary]) -> str:
     """The page, in Markdown."""
     reasons = dict.fromkeys(result.lpips_reason for result in study.results if result.lpips_reason)
     said = [HOW_TO_READ, *(f"LPIPS was not computed: {reason}." for reason in reasons)]
-    parts = [f"# {study.ablation.title}", *(textwrap.fill(text, 120, break_on_hyphens=False) for text in said)]
+    parts = [f"# {escaped(study.ablation.title)}", *(textwrap.fill(text, 120, break_on_hyphens=False) for text in said)]
     parts += [_machines(study), f"![PSNR and SSIM against seconds of training]({PLOT})"]
     for summary in summaries:
-        parts += [f"## {summary.scene}", _results(summary)]
+        parts += [f"## {escaped(summary.scene)}", _results(summary)]
         parts += [_times(summary)] if summary.targets else []
     ablation, tried = study.ablation, {result.variant for result in study.results}
     variants = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -74,8 +75,12 @@ class Evaluation(FurtherErrors):
 
 def append_evaluation(path: Path, evaluation: Evaluation) -> None:
     """Add one line to a history."""
-    with naming(path), open(path, "a", encoding="utf-8") as file:
+    with naming(path), open(path, "a", encoding="utf-8", opener=_no_link) as file:
         file.write(evaluation.to_json() + "\n")
+
+
+def _no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def read_history(path: Path) -> list[Evaluation]:
