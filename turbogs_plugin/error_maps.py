@@ -206,6 +206,9 @@ class ErrorMaps:
         return {**state, "view_sums": self.view_sums.clone(), **self._means.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Load a saved state. Raises `ValueError` where its numbers are none of maps."""
+        if min(state["stamp_base"], *(state[name].min() for name in ("errors", "view_sums", "mean_values"))) < 0:
+            raise ValueError("an error of the maps, or the iteration of their stamps, is negative")
         self._load(state["errors"], state["stamps"])
         self.stamp_base = int(state["stamp_base"])
         self.view_sums.copy_(state["view_sums"])

@@ -63,6 +63,9 @@ def test_colors_of_points_are_scaled_by_their_type(kind, given, read):
         )
 
 
+BEYOND_FLOAT32 = (("fl_x", 3e-307), ("fl_x", 1e299), ("cy", -3e231), ("cx", 1e40), ("fl_y", 1e-45))
+
+
 def set_poses(value, *views: int):
     return lambda content: [content["frames"][view].update(transform_matrix=value) for view in views or range(9)]
 
@@ -164,6 +167,7 @@ def test_frames_to_test_on(tmp_path):
     [
         (lambda content: content.update(camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR': known are OPENCV"),
         (lambda content: content.update(k4=0.1, k5=0.1), "f0.png has k4 and k5, which OPENCV does not"),
+        *((lambda content, n=n, v=v: content.update({n: v}), "beyond 1e.09 pixels") for n, v in BEYOND_FLOAT32),
         (lambda content: content.update(k1="much"), "k1 is 'much': it must be a finite number"),
         (lambda content: content["frames"][4].update(k1=-1e9), "f4.png is OPENCV with parameters that are not those"),
         (lambda content: content.pop("fl_x"), "neither fl_x nor a camera_angle_x"),

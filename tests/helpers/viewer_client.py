@@ -7,10 +7,12 @@ that, which are imported where they are used.
 from __future__ import annotations
 
 import io
+import socket
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 from PIL import Image
@@ -48,7 +50,11 @@ class ViewerClient:
         import zstandard
         from websockets.sync.client import connect
 
+        place = urlsplit(url)
+        if "Host" in headers:  # the page by another name
+            url = f"http://{headers.pop('Host')}"
         options = {"subprotocols": [f"viser-v{viser.__version__}"], "max_size": None, "compression": None}
+        options["sock"] = socket.create_connection((place.hostname, place.port))
         self._socket = connect(url.replace("http", "ws", 1), additional_headers=headers, **options)
         self._zstd = zstandard.ZstdDecompressor()
 

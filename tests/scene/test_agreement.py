@@ -9,7 +9,7 @@ import torch
 from turbogs_plugin.captures import load_scene, write_demo_capture
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.agreement import LEAST_LIKENESS, OTHER_AXES, likeness, require_agreement
+from turbogs_plugin.scene.agreement import LEAST_LIKENESS, OTHER_AXES, likeness, require_agreement, unseeing_note
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.types import Cameras
 
@@ -53,6 +53,13 @@ CONTRADICTIONS = {
     "intrinsics in shares": (shares, "in pixels"),
     "no alpha": (transparent, "alpha 0"),
 }
+
+
+def test_a_camera_that_sees_none_of_the_points_is_named(scene):
+    assert unseeing_note(scene) == ""
+    viewmats = scene.train.cameras.viewmats.clone()
+    viewmats[2, :3, 3] += torch.tensor([0.0, 0.0, -50.0])  # all points are behind it
+    assert unseeing_note(posed(scene, viewmats)) == f"1 cameras see none of the points: {scene.train.names[2]}"
 
 
 @pytest.mark.parametrize("case", CONTRADICTIONS)

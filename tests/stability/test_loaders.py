@@ -61,9 +61,12 @@ def with_other_places(value):
 def hostile_leaf(value, choice: random.Random):
     """Something else in the place of a value."""
     others = [None, "text", -1, 2**70, float("nan"), [], {}, [[1]], torch.zeros(0), torch.zeros(3, 1, 2), True]
+    others += [10**6, 2**31 - 1, -(10**6), 1e38] if not isinstance(value, torch.Tensor) else []
     if isinstance(value, torch.Tensor):
         others += [value[:-1], value.reshape(-1), torch.cat([value, value])] if value.dim() else [value.reshape(1)]
-        others += [torch.full_like(value, torch.nan)] if value.is_floating_point() else [value - 10**6]
+        limits = torch.finfo(value.dtype) if value.is_floating_point() else torch.iinfo(value.dtype)
+        extremes = (limits.min, limits.max, *((torch.nan,) if value.is_floating_point() else ()))
+        others += [torch.full_like(value, extreme) for extreme in extremes]
     return choice.choice(others)
 
 

@@ -1,5 +1,6 @@
 """The page as a client without a browser meets it: frames, hostile input, ports, and the commands that open it."""
 
+import contextlib
 import math
 import os
 import signal
@@ -11,6 +12,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -24,10 +26,11 @@ from turbogs_plugin.scene import Frame
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.live import LiveViewer
 from turbogs_plugin.viewer.pictures import Picture, draw
-from turbogs_plugin.viewer.server import INSTALL, Page
+from turbogs_plugin.viewer.server import INSTALL, Page, _own_name
 from turbogs_plugin.viewer.show import open_state
 
 pytest.importorskip("viser")
+ConnectionClosed = pytest.importorskip("websockets.exceptions").ConnectionClosed
 
 
 def test_pictures_and_views_are_chosen_on_the_page_and_moving_frames_are_jpeg(shown, state):
@@ -78,16 +81,43 @@ def test_a_hostile_client_ends_nothing(shown, state):
 
 
 def test_scripts_of_other_pages_are_turned_away(shown, state):
-    from websockets.exceptions import ConnectionClosed
-
     camera = ViewerCamera.of_view(state.capture.train.cameras, 0)
     with shown(state) as page:
         with ViewerClient(page.url, Origin=page.url) as client:
             client.look(camera)
             client.next_frame()
-        with pytest.raises(ConnectionClosed), ViewerClient(page.url, Origin="http://elsewhere.example") as client:
+        foreign, local = f"elsewhere.example:{urlsplit(page.url).port}", f"127.0.0.1:{urlsplit(page.url).port}"
+        with ViewerClient(page.url, Host=local, Origin=f"http://{local}") as client:
             client.look(camera)
-            client.next_frame(timeout=10.0)
+            client.next_frame()
+        for headers in ({}, {"Host": foreign}):  # a name of theirs that leads here is the second
+            with pytest.raises(ConnectionClosed):
+                ViewerClient(page.url, Origin=f"http://{foreign}", **headers).next_frame(timeout=10.0)
+
+
+@pytest.mark.parametrize(
+    ("host", "own", "others"),
+    [
+        ("127.0.0.1", ["localhost:80", "127.0.0.1", "[::1]:8080"], ["a.example:8080", "192.168.1.7:80", "", "[::1"]),
+        ("box.lan", ["box.lan:1", "localhost"], ["box.lan.example"]),
+        ("0.0.0.0", ["192.168.1.7:80", "[fe80::1]:80", f"{socket.gethostname()}:80"], ["a.example:8080"]),
+    ],
+)
+def test_a_page_answers_to_its_own_names(host, own, others):
+    assert [_own_name(name, host) for name in (*own, *others)] == [True] * len(own) + [False] * len(others)
+
+
+def test_garbage_of_clients_leaves_one_line(shown, state, capfd):
+    with shown(state) as page:
+        for garbage in (b"\xff\xfe", "text", b"\x80", b"\x90"):
+            with ViewerClient(page.url) as client, contextlib.suppress(ConnectionClosed):
+                client._socket.send(garbage)
+                for _ in client._socket:  # until it is turned away
+                    pass
+        with ViewerClient(page.url) as client:
+            client.look(ViewerCamera.of_view(state.capture.train.cameras, 0))
+            client.next_frame()
+    assert len(capfd.readouterr().err.splitlines()) == 1
 
 
 def test_a_training_goes_on_while_a_client_looks_and_when_it_leaves_a_pause(new_training, scene, unwatched):

@@ -23,6 +23,9 @@ LARGEST_SIDE = 65535
 LONGEST_NAME = 4096
 """Most letters of a photo's name."""
 
+LARGEST_PIXEL = 1e9
+"""Most pixels of a focal length or a principal point, and the reciprocal of the fewest: training uses float32."""
+
 AGAIN = "export or reconstruct it again"
 
 
@@ -89,13 +92,13 @@ class Capture:
             posed = np.isfinite(self.viewmats).all(axis=(1, 2)) & (np.abs(orthogonality).max(axis=(1, 2)) < 1e-3)
             posed &= np.linalg.det(np.nan_to_num(self.viewmats[:, :3, :3])) > 0
         focal = self.Ks[:, [0, 1], [0, 1]]
-        lensed = np.isfinite(self.Ks).all(axis=(1, 2)) & (focal > 0).all(axis=1)
+        lensed = (np.abs(self.Ks) < LARGEST_PIXEL).all(axis=(1, 2)) & (focal > 1.0 / LARGEST_PIXEL).all(axis=1)
         sized = ((self.sizes >= 1) & (self.sizes <= LARGEST_SIDE)).all(axis=1)
         whole, notes = posed & lensed & sized, []
         left = whole if self.test is None else whole & ~self.test
         for ok, trouble in (
             (posed, "a pose that is not a finite rotation and translation"),
-            (lensed, "intrinsics that are not finite with positive focal lengths"),
+            (lensed, f"intrinsics that are not finite with positive focal lengths, or beyond {LARGEST_PIXEL:g} pixels"),
             (sized, f"a size outside 1 .. {LARGEST_SIDE} pixels"),
         ):
             if not ok.all():

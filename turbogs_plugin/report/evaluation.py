@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from turbogs_plugin.config.configuration import Config
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.tables import views_table
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
@@ -56,6 +57,8 @@ def views_of(model: SavedModel, scene: Scene, split: str) -> tuple[PosedImages, 
     photos, where the run learnt them, or what these tell of the test photos."""
     views = scene.test if split == "test" else scene.train
     exposures = model.exposures
+    if exposures is not None and len(exposures) != len(scene.train):
+        raise InputError(f"the run has exposures of {len(exposures)} photos, its capture has {len(scene.train)}")
     if exposures is not None and split == "test":
         exposures = interpolated_exposures(exposures, scene.train.names, scene.test.names)
     return views, replace(model.own_look(views), exposures=exposures)

@@ -36,6 +36,23 @@ def require_agreement(scene: Scene) -> None:
         raise InputError(f"'{scene.name}': {cause}; scene.force=true trains all the same")
 
 
+def unseeing_note(scene: Scene) -> str:
+    """A line on cameras that see none of the points, which no error tells; empty where each sees one."""
+    points, blind = scene.points.cpu().numpy(), []
+    for views in () if scene.drawn_points else (scene.train, scene.test):
+        viewmats, Ks = views.cameras.viewmats.cpu().numpy(), views.cameras.Ks.cpu().numpy()
+        for name, viewmat, K, size in zip(views.names, viewmats, Ks, views.cameras.sizes, strict=True):
+            for step in (max(1, len(points) // MOST_POINTS), 1):  # all of them where none of some is seen
+                places = points[::step] @ viewmat[:3, :3].T + viewmat[:3, 3]
+                with np.errstate(all="ignore"):
+                    pixels = (places @ K.T)[:, :2] / places[:, 2:]
+                if ((places[:, 2:] > 0) & (pixels >= 0) & (pixels < size)).all(axis=1).any():
+                    break
+            else:
+                blind.append(name)
+    return f"{len(blind)} cameras see none of the points: {', '.join(blind[:3])}" if blind else ""
+
+
 def _contradiction(scene: Scene) -> str:
     """The cause and the remedy of `require_agreement`; empty where nothing contradicts."""
     views = scene.train

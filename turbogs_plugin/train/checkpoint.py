@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError, TrainingStopped
@@ -22,7 +23,7 @@ KEPT = 2
 """Checkpoints that stay on the disk: the newest and one before it."""
 
 COUNT_LIMIT = 2**31
-"""All whole numbers in a state are counts below this."""
+"""All whole numbers in a state are counts below this, in tensors below half of it."""
 
 CHECKED_AT_ONCE = 2**24
 """Numbers: error maps may be larger than the memory."""
@@ -92,6 +93,13 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return state
 
 
+def _in_range(part: Tensor) -> bool:
+    """Whether numbers are finite, and whole ones far from where one more is another number."""
+    if part.dtype in (torch.int32, torch.int64):
+        return not len(part) or -COUNT_LIMIT // 2 < int(part.min()) <= int(part.max()) < COUNT_LIMIT // 2
+    return bool(part.isfinite().all())
+
+
 def require_like(saved: Any, present: Any, place: str) -> None:
     """Refuse a state whose structure differs from the present one: other keys or types, other dtypes or dimensions of
     tensors. Numbers that are not finite are refused too.
@@ -111,7 +119,7 @@ def require_like(saved: Any, present: Any, place: str) -> None:
             require_like(saved[key], present[key], f"{place}.{key}")
     elif fits and isinstance(present, Tensor):
         fits = saved.dtype == present.dtype and saved.dim() == present.dim() and saved.shape[1:] == present.shape[1:]
-        fits = fits and all(part.isfinite().all() for part in saved.reshape(-1).split(CHECKED_AT_ONCE))
+        fits = fits and all(_in_range(part) for part in saved.reshape(-1).split(CHECKED_AT_ONCE))
     elif fits and isinstance(present, float):
         fits = math.isfinite(saved)
     elif fits and isinstance(present, int):

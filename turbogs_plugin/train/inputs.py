@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import torch
 
@@ -16,7 +17,7 @@ from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine import library
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.agreement import require_agreement
+from turbogs_plugin.scene.agreement import require_agreement, unseeing_note
 from turbogs_plugin.train.clock import WallClock
 
 PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
@@ -61,6 +62,8 @@ def open_scene(settings: SceneConfig, refine: bool, ranks: Ranks = ONE, trained:
     scene = load_scene(settings.path, settings.factor, settings.test_every, show_loading if ranks.first else None)
     if not (settings.force or trained):
         require_agreement(scene)
+    if note := unseeing_note(scene):
+        scene = replace(scene, notes=(*scene.notes, note))
     cameras = find_cameras(scene, refine) if ranks.first else None
     return with_cameras(scene, ranks.agree(cameras))
 

@@ -124,7 +124,10 @@ class Pace:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.iterations, self.refine_until = state["iterations"], state["refine_until"]
+        length = state["iterations"], state["refine_until"]
+        if self._budget is None and length != (self.iterations, self.refine_until):
+            raise ValueError(f"its length is {length[0]}, and the configuration's {self.iterations}")
+        self.iterations, self.refine_until = length
         self._mean, self._evaluated = state["iteration_seconds"], state["evaluated"]
 
 

@@ -28,7 +28,7 @@ from turbogs_plugin.model.similarity import Similarity, local_origin, placed
 from turbogs_plugin.model.torch_file import read_plain
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.fingerprint import frame_of_state
-from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
+from turbogs_plugin.train.checkpoint import COUNT_LIMIT, latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.train.look import Background, Look
 from turbogs_plugin.train.run_files import RunFolder
@@ -108,9 +108,12 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         if not all(value.isfinite().all() for _, value in gaussians.items()):
             raise ValueError("its Gaussians are not finite")
         exposures = trained["exposures"]["offsets"].to(device) if config.train.exposure is True else None
-        return SavedModel(
-            folder, config, gaussians, frame_of_state(state), operator.index(trained["iteration"]), exposures
-        )
+        if exposures is not None and not (exposures.shape[1:] == (3, 4) and exposures.isfinite().all()):
+            raise ValueError("its exposures are none")
+        iteration = operator.index(trained["iteration"])
+        if not 0 <= iteration < COUNT_LIMIT:
+            raise ValueError("its iteration is none")
+        return SavedModel(folder, config, gaussians, frame_of_state(state), iteration, exposures)
     except (KeyError, TypeError, AttributeError, IndexError, ValueError, RuntimeError) as error:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
 

@@ -216,6 +216,8 @@ class TrainingState:
         """
         if not 0 <= state["iteration"] <= self.iterations or state["nonfinite_losses"] < 0:
             raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
+        if state["maps"]["stamp_base"] > state["iteration"]:
+            raise ValueError(f"its error maps begin at iteration {state['maps']['stamp_base']}")
         self.iteration = state["iteration"]
         self.initial_error = state["initial_error"]
         self.nonfinite_losses.fill_(state["nonfinite_losses"])

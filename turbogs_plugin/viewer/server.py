@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import ipaddress
+import logging
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -81,7 +84,7 @@ class Page:
         self.capture: CaptureViews | None = None
         self.frames = Frames(self._send, self.wish)
         self.server = quiet_server(host, port)
-        _guard(self.server)
+        _guard(self.server, host)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self.server.gui.main_panel.dock_right()
         host = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
@@ -183,16 +186,46 @@ class Page:
         self.server.scene.set_background_image(pixels, format=kind, jpeg_quality=JPEG_QUALITY)
 
 
-def _guard(server: Any) -> None:
+def _own_name(asked: str, host: str) -> bool:
+    """Whether a page listens under the name that a client asks for, ``localhost:8080``. A foreign name that leads here
+    is the way of a foreign page's script. Where a page listens at every address, each is its own.
+
+    Args:
+        host: at which the page listens.
+    """
+    try:
+        name = urlsplit(f"//{asked}").hostname or ""
+        if name in ("localhost", "127.0.0.1", "::1", host.lower()):
+            return True
+        ipaddress.ip_address(name)
+        return host in ("0.0.0.0", "::")
+    except ValueError:
+        return host in ("0.0.0.0", "::") and name.removesuffix(".local") == socket.gethostname().lower()
+
+
+class _OneLine(logging.Handler):
+    """Says once that a client sent what is no message, where websockets would print a trace for each."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if self.level == logging.NOTSET:
+            self.setLevel(logging.CRITICAL + 1)
+            print("turbogs: the viewer turned a client away that sent what is no message", file=sys.stderr, flush=True)
+
+
+def _guard(server: Any, host: str) -> None:
     """Take from clients what viser would let them do: open a tunnel into the internet, which would make the page
-    public; and look from any web page that a browser on this machine has open."""
+    public; look from any web page that a browser on this machine has open, under whatever name (`_own_name`); and fill
+    stderr."""
     server.request_share_url = lambda *arguments, **options: None
     sockets = server._websock_server
+    logger = logging.getLogger("websockets.server")
+    logger.handlers, logger.propagate = [_OneLine(logging.NOTSET)], False
 
     async def refuse_foreign_pages(client: Any) -> None:
         connection = sockets._live_connections[client.client_id]
-        origin, host = (connection.request.headers.get(name) for name in ("Origin", "Host"))
-        if origin is not None and urlsplit(origin).netloc != host:
+        origins, hosts = (connection.request.headers.get_all(name) for name in ("Origin", "Host"))
+        own = len(hosts) == 1 and _own_name(hosts[0], host)
+        if not own or any(urlsplit(origin).netloc != hosts[0] for origin in origins):
             await connection.close(1008, "another page's script")
 
     sockets.on_client_connect(refuse_foreign_pages)
