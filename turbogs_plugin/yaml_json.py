@@ -6,6 +6,7 @@ Every module that reads or writes YAML or JSON goes through this one.
 from __future__ import annotations
 
 import json
+import math
 import re
 from copy import deepcopy
 from functools import lru_cache
@@ -165,8 +166,10 @@ def yaml_text(mapping: dict[str, Any]) -> str:
 
 
 def _whole(digits: str) -> int | float:
-    """A number without a point; a float where it has more digits than 63 bits."""
-    return int(digits) if len(digits) < 19 else float(digits)
+    """A number without a point; a float where it has more digits than 63 bits. `ValueError`: no float has as many."""
+    if not math.isfinite(number := float(digits)):
+        raise ValueError(f"a number of {len(digits)} digits")
+    return int(digits) if len(digits) < 19 else number
 
 
 def parse_json(text: str, where: str) -> Any:

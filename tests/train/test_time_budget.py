@@ -4,6 +4,7 @@ import os
 import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import stop_after, tiny_config
@@ -200,6 +201,22 @@ def test_stops_by_iterations_evaluate_and_save_where_asked(every):
     assert {iteration for iteration, due in dues.items() if due[1]} == saves
     assert {iteration for iteration, due in dues.items() if due[0]} == {1, 3, 5, 10}
     assert dues.keys() == saves | {1, 3, 5, 10}
+
+
+@pytest.mark.parametrize("cost", [0.002, 0.4, 30.0, 150.0])
+def test_at_most_five_minutes_are_at_risk(cost):
+    """Where iterations become slower, fourfold over the run, and after a resume."""
+    pace = pacing.Pace(TrainConfig(iterations=1000, evaluate_at=(), checkpoint_every=10_000))
+    iteration, seconds, saved = 0, 5000.0, [5000.0]
+    for _ in range(10_000):
+        mark = pace.next_mark(iteration, seconds)
+        seconds += cost * sum(1.0 + 3.0 * step / 1000 for step in range(iteration, mark))
+        iteration = mark
+        saved += [seconds] if pace.reached(iteration, seconds)[1] else []
+        if iteration == pace.iterations:
+            break
+    assert iteration == 1000 and np.diff(saved).max() <= max(300.0, 4.0 * cost)
+    assert len(saved) <= 2 + (seconds - 5000.0) / pacing.SAVE_AFTER
 
 
 def test_stops_by_time_evaluate_once_a_fraction_and_save_at_intervals():

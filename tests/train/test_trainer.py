@@ -3,8 +3,10 @@
 import json
 import math
 import os
+import pty
 import shutil
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,6 +31,7 @@ from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.train.metrics import evaluate
+from turbogs_plugin.train.session import interruptible
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import LossOutput, PixelSamples, RowUpdate
 from turbogs_plugin.yaml_json import parse_yaml
@@ -93,9 +96,11 @@ def test_moments_and_statistics_follow_their_gaussians(capture):
 STOPS = {
     **dict.fromkeys((1, 2, 3, 5, 6), signal.SIGINT),
     7: signal.SIGTERM,
-    **dict.fromkeys((9, 10, 12), signal.SIGINT),
+    9: signal.SIGHUP,
+    **dict.fromkeys((10, 12), signal.SIGINT),
 }
-"""Before and after events of density control, at an evaluation, at checkpoints; by Ctrl-C, and once by `kill`."""
+"""Before and after events of density control, at an evaluation, at checkpoints; by Ctrl-C, and once by `kill` and by a
+terminal that closes."""
 
 
 def test_a_run_stopped_again_and_again_is_the_same_bit_for_bit(capture, whole, tmp_path, monkeypatch):
@@ -129,6 +134,37 @@ def test_a_run_stopped_again_and_again_is_the_same_bit_for_bit(capture, whole, t
     histories = (read_history(outcome.folder.history) for outcome in (whole, resumed))
     numbers = [[(e.iteration, e.psnr, e.ssim, e.l1, e.num_gaussians) for e in history] for history in histories]
     assert numbers[0] == numbers[1]
+
+
+def test_a_closed_terminal_and_its_shell_are_one_signal_and_none_under_nohup():
+    stops = []
+    with interruptible(stops.append):
+        signal.raise_signal(signal.SIGHUP)
+        signal.raise_signal(signal.SIGHUP)
+    assert stops == [signal.SIGHUP] and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interruptible(stops.append):
+            signal.raise_signal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    assert stops == [signal.SIGHUP]
+
+
+def test_a_run_stops_and_saves_when_its_terminal_closes(capture, tmp_path):
+    """Whatever it would write to the terminal is lost, and nothing else."""
+    (tmp_path / "config.yaml").write_text(tiny_config(capture, "train.iterations=100000").to_yaml())
+    code = "from turbogs_plugin.cli import main; main()"
+    words = ["train", str(capture), "--config", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "run")]
+    process, terminal = pty.fork()
+    if not process:
+        os.execv(sys.executable, [sys.executable, "-c", code, *words])
+    told = b""
+    while b"it/s" not in told and (part := os.read(terminal, 1000)):  # training has begun
+        told += part
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 128 + signal.SIGHUP
+    assert latest_checkpoint(tmp_path / "run" / "checkpoints") is not None
 
 
 def killed_at_7(capture: Path, out: Path) -> None:

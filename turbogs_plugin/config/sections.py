@@ -105,7 +105,8 @@ class TrainConfig:
         average_last: share of the iterations, at the end of the run and since the last change of the set of Gaussians,
             whose mean the model becomes (`turbogs_plugin.train.parameter_mean`). 0: the model of the last iteration.
         evaluate_at: times of evaluations, as fractions of T; the start and the end are always evaluated.
-        checkpoint_every: iterations between checkpoints; the end always has one. 0: only the end.
+        checkpoint_every: iterations between checkpoints, which a few minutes of training end, too; the end always has
+            one. 0: only the end.
     """
 
     iterations: int | Auto = 5000

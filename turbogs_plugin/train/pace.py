@@ -25,6 +25,9 @@ from turbogs_plugin.train.trainer import Trainer
 
 MARK_SHARE = 0.03
 """Share of a time budget between two checks of the clock; at most half of the time left."""
+SAVE_AFTER, LOOK_AFTER = 200.0, 50.0
+"""Seconds of training after which a checkpoint is due, and between two looks at the clock for that: where iterations
+become twice as slow meanwhile, five minutes are at risk."""
 TRIAL_ITERATIONS = {"cuda": 20, "cpu": 2}
 """Iterations that are timed before a run with a time budget. As many before them load code and size buffers."""
 
@@ -81,6 +84,8 @@ class Pace:
         self._save_every = train.checkpoint_every or math.inf
         self._refine_share = min(1.0, self.refine_until / self.iterations)
         self._mean = 0.0  # seconds of a recent iteration; 0: none was timed
+        self._latest = math.inf  # seconds of an iteration of the latest stretch
+        self._saved: float | None = None  # seconds at the last checkpoint
         self._last = (0, 0.0)  # iteration and seconds where the present stretch began
         self._evaluated = 0  # marks of evaluations that were passed
 
@@ -88,6 +93,10 @@ class Pace:
         """The finished iteration to stop at next."""
         self._last = (iteration, seconds)
         marks: list[float] = [iteration - iteration % self._save_every + self._save_every]
+        if self._saved is None:
+            self._saved = seconds
+        if self._save_every < math.inf:
+            marks.append(iteration + max(1, int(LOOK_AFTER / max(1e-9, self._latest))))
         marks += [mark for mark in self._evaluations() if mark > iteration]
         if self._budget is not None:
             left = max(0.0, self._budget - seconds)
@@ -99,6 +108,8 @@ class Pace:
     def reached(self, iteration: int, seconds: float) -> tuple[bool, bool]:
         """Whether an evaluation is due where training has stopped, and whether a checkpoint is."""
         before, began = self._last
+        if iteration > before:
+            self._latest = (seconds - began) / (iteration - before)
         if self._budget is not None and iteration > before:
             latest = (seconds - began) / (iteration - before)
             weight = min(0.5, (seconds - began) / (MARK_SHARE * self._budget)) if self._mean else 1.0
@@ -109,7 +120,10 @@ class Pace:
                 self.refine_until = max(iteration, round(self._refine_share * self.iterations))
         finished, passed = iteration >= self.iterations, sum(mark <= iteration for mark in self._evaluations())
         evaluate, self._evaluated = finished or passed > self._evaluated, max(passed, self._evaluated)
-        return evaluate, finished or iteration % self._save_every == 0
+        late = self._save_every < math.inf and seconds - (self._saved or 0.0) >= SAVE_AFTER
+        if save := finished or late or iteration % self._save_every == 0:
+            self._saved = seconds
+        return evaluate, save
 
     def _evaluations(self) -> set[int]:
         """Counts of finished iterations after which to evaluate."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -41,15 +42,22 @@ REFRESH_SECONDS = 0.1
 
 @contextmanager
 def interruptible(stop: Callable[[int], None]) -> Iterator[None]:
-    """While entered, the first SIGINT or SIGTERM calls `stop` with its number, and a second one ends the process.
+    """While entered, the first SIGINT, SIGTERM or SIGHUP calls `stop` with its number, and a second one ends the
+    process, but for SIGHUP: a terminal that closes and its shell send one each. nohup's SIGHUP stays ignored.
 
     Python allows handlers in the main thread alone; in others signals keep their usual effect.
     """
-    handled = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    here = threading.current_thread() is threading.main_thread()
+    hangup = signal.SIGHUP if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN else signal.SIGTERM
+    handled = {signal.SIGINT, signal.SIGTERM, hangup} if here else set()
+    terminals = [descriptor for descriptor in (1, 2) if os.isatty(descriptor)]  # a closed one is none
 
     def handle(number: int, frame: FrameType | None) -> None:
         for each in handled:
-            signal.signal(each, signal.default_int_handler)
+            signal.signal(each, signal.SIG_IGN if each == signal.SIGHUP else signal.default_int_handler)
+        if number == signal.SIGHUP:  # whoever writes to a closed terminal ends by an error
+            for descriptor in terminals:
+                os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
         stop(number)
 
     previous = {number: signal.signal(number, handle) for number in handled}
@@ -214,7 +222,8 @@ class TrainingProgress(Listener):
         trainer, speed = loop.trainer, self._bar.tasks[0].speed or 0.0
         said = f"{speed:,.0f} it/s  {self._psnr}{len(trainer.gaussians):,} Gaussians  {self._warning}"
         self._bar.update(self._task, completed=trainer.iteration, total=trainer.iterations, description=said)
-        self._bar.refresh()
+        with suppress(OSError):  # a terminal that closes
+            self._bar.refresh()
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         counts = {"non-finite losses": evaluation.nonfinite_losses, "skipped updates": evaluation.skipped_updates}
