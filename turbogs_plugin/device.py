@@ -36,6 +36,12 @@ def free_device_memory(device: torch.device) -> None:
         torch.cuda.empty_cache()
 
 
+def free_bytes(device: torch.device) -> int:
+    """Memory of a GPU that this process may still take: what nobody has, and what torch keeps unused."""
+    unused = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return torch.cuda.mem_get_info(device)[0] + unused
+
+
 def memory_bytes(device: torch.device) -> int:
     """Memory of the tensors on a GPU now, without what processes share (`distributed.peer_memory`); on a CPU, the peak
     of this process. Does not wait for the GPU."""

@@ -1,6 +1,7 @@
 """The cap on Gaussians, and what a run takes of the device's memory."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from turbogs_plugin.plan.memory import (
     MemoryDemand,
     cap_of,
     most_images,
+    room_note,
     with_cap,
     within_memory,
 )
@@ -40,6 +42,30 @@ def test_a_memory_budget_leaves_room_for_what_is_grown_beyond_the_cap(capture, s
     most = MemoryDemand.of(config, scene.train.cameras.sizes, scene.test.cameras.sizes).gaussians(100 * 2**20)
     assert cap_of(within_memory(config, scene)) == int(most / times)
     assert cap_of(within_memory(with_cap(config, 9), scene)) == 9
+
+
+@pytest.mark.parametrize(
+    ("gaussians", "free", "said"),
+    [
+        (0, 2**30, ""),
+        (
+            2_000_000,
+            2**32,
+            r"2,000,000 Gaussians take \d\.\d GiB .* 4\.0 GiB are free, .*: --max-gaussians \d+ would fit",
+        ),
+        (2_000_000, 2**36, ""),
+        (0, 2**20, "73 Gaussians take .*: train.pixels_place=host or a larger --factor would fit"),
+    ],
+)
+def test_what_does_not_fit_is_said_with_the_number_that_would(capture, gaussians, free, said):
+    config, scene = load_config("turbogs", [f"density.max_gaussians={gaussians}"]).without_plan(), load_scene(capture)
+    note = room_note(config, scene, free)
+    assert re.match(said or "$", note)
+    if "--max" in note:
+        fits = int(note.partition("--max-gaussians ")[2].split()[0])
+        assert (
+            room_note(with_cap(config, fits), scene, free) == "" != room_note(with_cap(config, fits + 1), scene, free)
+        )
 
 
 @pytest.mark.parametrize("kind", ["gsplat_default", "fastgs"])

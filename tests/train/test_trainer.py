@@ -8,6 +8,7 @@ import shutil
 import signal
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -186,6 +187,31 @@ def test_a_run_killed_without_notice_resumes_bit_for_bit(capture, whole, tmp_pat
     assert saved(tmp_path / "run")["iteration"] == 6
     run.resume(tmp_path / "run")
     assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_run_whose_memory_is_full_on_the_way_goes_on_once_from_its_checkpoint(
+    capture, whole, tmp_path, monkeypatch, capfd, times
+):
+    """By the same bits, where another process took the memory for a while."""
+    step, left = Trainer.step, [times]
+
+    def full(trainer):
+        if trainer.iteration == 7 and left[0]:
+            left[0] -= 1
+            trainer.gaussians.means += 1.0  # in the midst of an iteration
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        step(trainer)
+
+    monkeypatch.setattr(Trainer, "step", full)
+    again = partial(run.train, tiny_config(capture, "train.checkpoint_every=4"), tmp_path / "run")
+    if times == 2:
+        with pytest.raises(TrainingStopped, match=r"iteration 7: .* the last good checkpoint is .*iteration-000004"):
+            again()
+    else:
+        assert_identical(saved(whole.folder.path), saved(again().folder.path))
+        assert [entry.iteration for entry in read_history(tmp_path / "run/history.jsonl")] == [0, 7, 14]
+    assert "iteration 7: the device's memory was full; once more from iteration 4" in capfd.readouterr().err
 
 
 def terminated(capture: Path) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
+from turbogs_plugin.device import free_bytes
 from turbogs_plugin.error_maps import MAP_BYTES
 from turbogs_plugin.plan.photo_gains import compare_exposures
 from turbogs_plugin.scene import Scene
@@ -71,10 +72,7 @@ def gather_facts(
     pixels, test_pixels = (int(part.cameras.sizes.prod(axis=1).sum()) for part in (scene.train, scene.test))
     gains = compare_exposures(views, scene.points) if with_exposures else None
     host_free = free_host_bytes()
-    free = host_free
-    if device.type == "cuda":
-        free = torch.cuda.mem_get_info(device)[0]
-        free += torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    free = free_bytes(device) if device.type == "cuda" else host_free
     return SceneFacts(
         train_views=len(views),
         direction_concentration=float(views.cameras.directions.double().mean(dim=0).norm()),

@@ -146,6 +146,38 @@ def hold_to_limit(config: Config, device: torch.device) -> None:
         torch.cuda.set_per_process_memory_fraction(min(1.0, limit / total))
 
 
+def room_note(config: Config, scene: Scene, free: int) -> str:
+    """A line where the initial Gaussians, or as many as the cap allows, take more than the free memory of the device,
+    with the number that fits; empty where they fit, and where a limit of memory is kept instead.
+
+    Args:
+        free: bytes.
+    """
+    demand, cap = _demand(config, scene), cap_of(config)
+    first = 0 if config.train.starts_from_model else min(len(scene.points), cap or len(scene.points))
+    most = int((free - demand.fixed) / demand.per_gaussian / _growth(config))
+    if config.budget.memory_bytes() is not None or most >= max(first, cap, FEWEST_GAUSSIANS):
+        return ""
+    count = cap if first <= most else first
+    remedy = f"--max-gaussians {most}" if most >= FEWEST_GAUSSIANS else "train.pixels_place=host or a larger --factor"
+    needed = demand.fixed + int(_growth(config) * count) * demand.per_gaussian
+    return (
+        f"{count:,} Gaussians take {needed / 2**30:.1f} GiB of the GPU, of which {free / 2**30:.1f} GiB are free, as "
+        f"estimated: {remedy} would fit"
+    )
+
+
+def _demand(config: Config, scene: Scene) -> MemoryDemand:
+    sizes = (scene.train.cameras.sizes, scene.test.cameras.sizes)
+    return MemoryDemand.of(config, *sizes, photo_bytes=scene.train.photos.stored.shape[1])
+
+
+def _growth(config: Config) -> float:
+    """Most Gaussians on the way over those of the finished model."""
+    train = config.train
+    return config.build("density").growth_room(Step(0, train.written_iterations, train.refine_until))
+
+
 def within_memory(config: Config, scene: Scene) -> Config:
     """The configuration whose largest number of Gaussians fits into its limit of memory, if it has one.
 
@@ -158,9 +190,5 @@ def within_memory(config: Config, scene: Scene) -> Config:
     limit = config.budget.memory_bytes()
     if limit is None:
         return config
-    sizes = (scene.train.cameras.sizes, scene.test.cameras.sizes)
-    demand = MemoryDemand.of(config, *sizes, photo_bytes=scene.train.photos.stored.shape[1])
-    train = config.train
-    growth = config.build("density").growth_room(Step(0, train.written_iterations, train.refine_until))
-    fitting = max(1, int(demand.gaussians(limit) / growth))
+    fitting = max(1, int(_demand(config, scene).gaussians(limit) / _growth(config)))
     return with_cap(config, min(fitting, cap_of(config) or fitting))

@@ -13,12 +13,13 @@ import torch
 from turbogs_plugin.captures.camera_refinement import refine_cameras
 from turbogs_plugin.captures.kinds import holds_photos_alone
 from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, resolve
+from turbogs_plugin.device import free_bytes
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.plan import Plan, make_plan
-from turbogs_plugin.plan.memory import hold_to_limit, most_views, within_memory
+from turbogs_plugin.plan.memory import hold_to_limit, most_views, room_note, within_memory
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.clock import WallClock
@@ -69,7 +70,10 @@ def new_loop(config: Config, scene: Scene, device: torch.device, ranks: Ranks = 
     hold_to_limit(config, device)
     if ranks.count > 1:  # the first process's plan: plans look at the machine's free memory, which differs
         config = resolve(ranks.agree(config.to_mapping()))
-    config, seconds = fitted_to_time(within_memory(config, scene), scene, device, ranks)
+    config = within_memory(config, scene)
+    if device.type == "cuda" and ranks.first and (note := room_note(config, scene, free_bytes(device))):
+        print(note, file=sys.stderr)
+    config, seconds = fitted_to_time(config, scene, device, ranks)
     trainer = Trainer(config, scene, device, engine=ranks.engine(device))
     return TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), seconds=seconds, ranks=ranks)
 

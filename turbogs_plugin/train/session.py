@@ -16,15 +16,16 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from turbogs_plugin.device import free_device_memory
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.scene.offload import place_views
-from turbogs_plugin.train.checkpoint import latest_checkpoint, require_like, save_checkpoint
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
 from turbogs_plugin.train.clock import WallClock, WallRecord
-from turbogs_plugin.train.history import Evaluation, append_evaluation
+from turbogs_plugin.train.history import Evaluation, append_evaluation, rewind_history
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.metrics import Evaluations
 from turbogs_plugin.train.run_files import RunFolder
@@ -101,7 +102,7 @@ class RunSession(Listener):
                 if ranks.first:
                     progress = TrainingProgress(shown)
                     loop.listeners += [self.evaluations, progress, *(listener_of(self) for listener_of in watch)]
-                loop.run(self.resumed)
+                self._train()
                 self.clock.mark("training")
                 if loop.finished and ranks.first:
                     trainer.require_finite()
@@ -130,6 +131,24 @@ class RunSession(Listener):
                 f"Gaussians; try --max-gaussians {round(0.7 * len(trainer.gaussians))}; {self._last_good()}"
             ) from error
         return self
+
+    def _train(self) -> None:
+        """Train to the end or a signal. Where the device's memory is full on the way, which others may share, training
+        goes on once from the newest checkpoint, with memory of passes sized anew and what is unused given back."""
+        try:
+            return self.loop.run(self.resumed)
+        except torch.cuda.OutOfMemoryError:
+            checkpoint = latest_checkpoint(self.folder.checkpoints)
+            if checkpoint is None or self.loop.ranks.count > 1:
+                raise
+        full = self.trainer.iteration
+        self.trainer.engine = self.loop.ranks.engine(self.trainer.device)
+        free_device_memory(self.trainer.device)
+        self.load_state_dict(load_checkpoint(checkpoint), str(checkpoint))
+        self.history[:] = rewind_history(self.folder.history, self.trainer.iteration)
+        line = f"iteration {full}: the device's memory was full; once more from iteration {self.trainer.iteration}"
+        print(line, file=sys.stderr, flush=True)
+        return self.loop.run(resumed=True)
 
     def _stop(self, number: int) -> None:
         self.signal = number

@@ -218,7 +218,7 @@ class TrainingState:
             raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
         if state["maps"]["stamp_base"] > state["iteration"]:
             raise ValueError(f"its error maps begin at iteration {state['maps']['stamp_base']}")
-        self.iteration = state["iteration"]
+        self.iteration = self._earliest = state["iteration"]
         self.initial_error = state["initial_error"]
         self.nonfinite_losses.fill_(state["nonfinite_losses"])
         saved = read_gsplat({"splats": state["gaussians"]}, "the checkpoint")
