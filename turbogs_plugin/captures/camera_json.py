@@ -21,8 +21,10 @@ from turbogs_plugin.yaml_json import parse_json
 BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 """Names of one model, whose missing coefficients are 0."""
 FISHEYE = "OPENCV_FISHEYE"
-FOR_ALL = ("camera_model", "is_fisheye", "w", "h", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "mask_path")
-FOR_ALL += ("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
+FOR_ALL = (
+    *("camera_model", "is_fisheye", "w", "h", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "mask_path"),
+    *("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "integer_depth_scale"),
+)
 """Keys of a file that hold for each frame without a value of its own."""
 
 

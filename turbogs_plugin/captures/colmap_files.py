@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from turbogs_plugin.captures.capture import bytes_of, text_of
+from turbogs_plugin.captures.capture import LONGEST_NAME, bytes_of, text_of
 from turbogs_plugin.captures.starting_points import GREY, read_cloud
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.ply import read_colors
@@ -42,7 +42,6 @@ SENSORS = {"CAMERA": 0, "IMU": 1}
 """Kinds of sensors of a rig."""
 SMALLEST_IMAGE, SMALLEST_CAMERA = 73, 24
 """Bytes of an image with a name of one letter and without features; of a camera without parameters."""
-LONGEST_NAME = 4096
 NO_FEATURES = np.zeros(0, FEATURE)
 NUMBER = re.compile(r"[-+.\de]+|[-+]?(nan|inf)", re.IGNORECASE)
 IMAGE = re.compile(r"\s*" + r"(\S+)\s+" * 8 + r"(\S+)[ \t](.+)")

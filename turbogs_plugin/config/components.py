@@ -74,7 +74,8 @@ def foreign_code(mapping: Mapping[str, Any]) -> dict[str, str]:
     installed = {(point.group, point.name) for each in distributions(path=places) for point in each.entry_points}
     found = {}
     for kind in KINDS:
-        name, group = str(mapping[kind].get("type", default_type(kind))), f"turbogs.{kind}"
+        section, group = mapping.get(kind), f"turbogs.{kind}"
+        name = str(section.get("type", default_type(kind))) if isinstance(section, Mapping) else default_type(kind)
         values = [name] if ":" in name else [point.value for point in entry_points(group=group, name=name)]
         if name in TYPES[kind] or (group, name) in installed:
             continue

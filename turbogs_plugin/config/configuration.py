@@ -144,11 +144,10 @@ def resolve(mapping: Mapping[str, Any], built: bool = True) -> Config:
         name: build_dataclass(cls, mapping.get(name, {}), name) for name, cls in SECTION_CLASSES.items()
     }
     for kind in KINDS:
-        section = mapping.get(kind, {})
+        sections[kind] = given = mapping.get(kind, {})
         if built:
-            strategy = build(kind, section)
-            section = {"type": section.get("type", default_type(kind)), **dataclass_mapping(strategy)}
-        sections[kind] = section
+            strategy = build(kind, given)
+            sections[kind] = {"type": given.get("type", default_type(kind)), **dataclass_mapping(strategy)}
     return Config(**sections)
 
 
@@ -167,10 +166,8 @@ def resolve_complete(
         InputError: a part of it is missing or, where that is asked for, left to a plan; or it names code that is not
             installed.
     """
-    for section in KINDS:
-        if not isinstance(mapping.get(section), Mapping):
-            raise InputError(f"'{where}': section '{section}' is missing: bring the file back, or train anew")
-    for what, file in foreign_code(mapping).items() if built else ():
+    foreign = foreign_code(mapping) if built else {}
+    for what, file in foreign.items():
         if not trusted:
             raise InputError(f"'{where}': {what} runs code that is not installed ({file}): read it, then give --trust")
         print(f"turbogs: {what} of '{where}' runs {file}", file=sys.stderr)

@@ -120,7 +120,8 @@ def _require_bounded(path: Path) -> None:
 def _require_plain(pickled: bytes) -> None:
     """Refuse values that call other names than those of `PLAIN`, and tuples in several places: nested, they are keys
     whose hash takes endless time, and values that no walk comes to the end of."""
-    tuples, made = set(), ""
+    tuples: set[object] = set()
+    made = ""
     for code, argument, _ in pickletools.genops(pickled):
         if code.name == "GLOBAL" and not PLAIN.fullmatch(str(argument)):
             raise ValueError(f"it holds more than plain tensors and values: {str(argument)[:60]}")

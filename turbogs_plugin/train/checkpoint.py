@@ -93,13 +93,6 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     return state
 
 
-def _in_range(part: Tensor) -> bool:
-    """Whether numbers are finite, and whole ones far from where one more is another number."""
-    if part.dtype in (torch.int32, torch.int64):
-        return not len(part) or -COUNT_LIMIT // 2 < int(part.min()) <= int(part.max()) < COUNT_LIMIT // 2
-    return bool(part.isfinite().all())
-
-
 def require_like(saved: Any, present: Any, place: str) -> None:
     """Refuse a state whose structure differs from the present one: other keys or types, other dtypes or dimensions of
     tensors. Numbers that are not finite are refused too.
@@ -119,7 +112,9 @@ def require_like(saved: Any, present: Any, place: str) -> None:
             require_like(saved[key], present[key], f"{place}.{key}")
     elif fits and isinstance(present, Tensor):
         fits = saved.dtype == present.dtype and saved.dim() == present.dim() and saved.shape[1:] == present.shape[1:]
-        fits = fits and all(_in_range(part) for part in saved.reshape(-1).split(CHECKED_AT_ONCE))
+        fits = fits and all(part.isfinite().all() for part in saved.reshape(-1).split(CHECKED_AT_ONCE))
+        if fits and saved.dtype in (torch.int32, torch.int64):
+            fits = not saved.numel() or -COUNT_LIMIT // 2 < int(saved.min()) <= int(saved.max()) < COUNT_LIMIT // 2
     elif fits and isinstance(present, float):
         fits = math.isfinite(saved)
     elif fits and isinstance(present, int):

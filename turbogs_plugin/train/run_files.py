@@ -72,13 +72,10 @@ class RunFolder:
         except (OSError, NotImplementedError) as error:
             print(f"turbogs: '{self.path}' cannot be locked ({error}): let one process write to it", file=sys.stderr)
         try:
-            others = {entry.name for entry in self.path.iterdir()} - {self.lock.name, self.owner.name}
-            if new and others:
+            if new and {*self.path.iterdir()} - {self.lock, self.owner}:
                 raise InputError(f"--out '{self.path}' is not empty: another process has written to it meanwhile")
             if before := read_text(self.owner):
-                print(
-                    f"turbogs: {before[:80]} was killed, and its lock on '{self.path}' is taken over", file=sys.stderr
-                )
+                print(f"turbogs: {before[:80]} was killed: '{self.path}' is taken over from it", file=sys.stderr)
             write_text_atomically(self.owner, f"process {os.getpid()} of {socket.gethostname()}")
             yield
         finally:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-import ipaddress
 import logging
+import re
 import socket
 import sys
 import threading
@@ -187,20 +187,15 @@ class Page:
 
 
 def _own_name(asked: str, host: str) -> bool:
-    """Whether a page listens under the name that a client asks for, ``localhost:8080``. A foreign name that leads here
-    is the way of a foreign page's script. Where a page listens at every address, each is its own.
-
-    Args:
-        host: at which the page listens.
-    """
+    """Whether ``localhost:8080``, which a client asks for, names a page that listens at `host`; at 0.0.0.0, any address
+    does and the machine's name. A foreign name that leads here is the way of a foreign page's script."""
     try:
         name = urlsplit(f"//{asked}").hostname or ""
-        if name in ("localhost", "127.0.0.1", "::1", host.lower()):
-            return True
-        ipaddress.ip_address(name)
-        return host in ("0.0.0.0", "::")
     except ValueError:
-        return host in ("0.0.0.0", "::") and name.removesuffix(".local") == socket.gethostname().lower()
+        return False
+    everywhere, machine = host in ("0.0.0.0", "::"), socket.gethostname().lower()
+    own = {"localhost", "127.0.0.1", "::1", host.lower(), *([machine, f"{machine}.local"] if everywhere else [])}
+    return name in own or (everywhere and bool(re.fullmatch(r"[\d.]+|[\da-f:.]*:[\da-f:.]*", name)))
 
 
 class _OneLine(logging.Handler):
