@@ -62,7 +62,7 @@ def read_text(path: Path) -> str | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read '{path}': {error}") from None
+        raise InputError(f"cannot read '{path}': {error}; write or copy it again") from None
     if len(text) > JSON_LIMIT:
         raise InputError(f"cannot read '{path}': it has more than {JSON_LIMIT >> 20} MiB")
     return text
