@@ -55,6 +55,8 @@ def test_a_tiff_that_pillow_would_turn_is_refused(tmp_path, orientation):
 def test_what_is_no_photo_is_named_by_its_content(tmp_path, start, said):
     (tmp_path / "photo.jpg").write_bytes(start + (start and bytes(100)))
     assert_refused(f"cannot read the photo .*photo.jpg: {said}", photo_sizes, [tmp_path / "photo.jpg"])
+
+
 @pytest.mark.parametrize("form", [*decoding.FORMATS, "MPO", "EPS", "PDF", "GIF", "PPM", "WEBP", "TGA", "ICO", "SGI"])
 def test_only_photos_are_photos(tmp_path, form, monkeypatch):
     """By their content; a format that Pillow knows and cameras do not write never comes to its decoder."""

@@ -14,7 +14,6 @@ from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.captures.decoding import photo_size
 from turbogs_plugin.captures.undistort import Lens, lens_of_camera
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.files import read_text
 from turbogs_plugin.scene.geometry import viewmat_of_pose
 from turbogs_plugin.yaml_json import parse_json
 

@@ -131,8 +131,8 @@ def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | 
 
 def _forms(name: str, folder: str) -> list[str]:
     """The paths in a scene that a name may mean in a folder: the name there; of a path of the machine that wrote it,
-    absolute or with '..', each of its ends of `DEEPEST` parts and fewer, the longest first. Separators may be Windows' ones. A copy of
-    ``images/a.png`` is ``images_2/a.png``."""
+    absolute or with '..', each of its ends of `DEEPEST` parts and fewer, the longest first. Separators may be Windows'
+    ones. A copy of ``images/a.png`` is ``images_2/a.png``."""
     path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
     parts = path.parts[bool(path.anchor) or (folder in REDUCED and path.parts[:1] == (IMAGES,)) :]
     parts = (folder, *parts[-DEEPEST:]) if folder else parts[-DEEPEST:]
