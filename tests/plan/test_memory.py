@@ -54,7 +54,7 @@ def test_a_memory_budget_leaves_room_for_what_is_grown_beyond_the_cap(capture, s
             r"2,000,000 Gaussians take \d\.\d GiB .* 4\.0 GiB are free, .*: --max-gaussians \d+ would fit",
         ),
         (2_000_000, 2**36, ""),
-        (0, 2**20, "73 Gaussians take .*: train.pixels_place=host or a larger --factor would fit"),
+        (0, 2**20, r"1,000 Gaussians take .*: train\.pixels_place=host or a larger --factor would fit"),
     ],
 )
 def test_what_does_not_fit_is_said_with_the_number_that_would(capture, gaussians, free, said):

@@ -158,7 +158,7 @@ def room_note(config: Config, scene: Scene, free: int) -> str:
     most = int((free - demand.fixed) / demand.per_gaussian / _growth(config))
     if config.budget.memory_bytes() is not None or most >= max(first, cap, FEWEST_GAUSSIANS):
         return ""
-    count = cap if first <= most else first
+    count = first if first > most else max(cap, FEWEST_GAUSSIANS)
     remedy = f"--max-gaussians {most}" if most >= FEWEST_GAUSSIANS else "train.pixels_place=host or a larger --factor"
     needed = demand.fixed + int(_growth(config) * count) * demand.per_gaussian
     return (
