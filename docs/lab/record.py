@@ -12,6 +12,7 @@ import math
 import statistics
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -103,12 +104,10 @@ def headline() -> str:
     shown, columns = list(MEASURES)[:5], []
     for measure in shown:
         values = [method.mean(measure) for method in METHODS]
-        known = [value for value in values if not math.isnan(value)]
-        best = text(measure, (max if measure in ("psnr", "ssim") else min)(known, default=math.nan))
-        texts = [text(measure, value) for value in values]
-        columns.append([f"**{cell}**" if cell == best != "-" else cell for cell in texts])
-    names = [method.name for method in METHODS]
-    return table(("", *(MEASURES[of][0] for of in shown)), zip(names, *columns, strict=True))
+        top = (max if measure in ("psnr", "ssim") else min)(values)
+        best = "-" if any(map(math.isnan, values)) else text(measure, top)
+        columns.append([f"**{cell}**" if cell == best != "-" else cell for cell in map(partial(text, measure), values)])
+    return table(("", *(MEASURES[of][0] for of in shown)), zip((of.name for of in METHODS), *columns, strict=True))
 
 
 def claim() -> str:

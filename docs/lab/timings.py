@@ -99,6 +99,7 @@ def rank_runs() -> str:
 
 SWAPS = {
     "stock": "stock",
+    "step": "the whole step",
     "density": "density control",
     "errors": "density control, ranked by errors",
     "lm": "density control by errors, and Moment-LM",

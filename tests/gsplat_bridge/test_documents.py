@@ -12,7 +12,7 @@ from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_spl
 from turbogs_plugin.types import Step
 
 ROOT = Path(__file__).resolve().parents[2]
-README, DROP_IN = ROOT / "README.md", ROOT / "docs" / "drop-in.md"
+DROP_IN = ROOT / "docs" / "drop-in.md"
 
 
 def block(document: Path, language: str, containing: str) -> str:
@@ -56,7 +56,7 @@ def assert_updated(maps, before, samples, errors):
 
 
 def test_sparse_pixels(host):
-    """README's sparse pixels are a trainer's own lines (tests/test_simple_trainer.py)."""
+    """Sparse pixels are a trainer's own lines (tests/test_simple_trainer.py)."""
     before = host["maps"].errors.clone()
     exec(block(DROP_IN, "diff", "sparse_rasterization"), host)
     host["loss"].backward()
@@ -64,17 +64,14 @@ def test_sparse_pixels(host):
     assert_updated(host["maps"], before, host["samples"], errors)
 
 
-@pytest.mark.parametrize(("document", "language"), [(README, "diff"), (DROP_IN, "python")])
-def test_sampler_and_loss_alone(host, document, language):
+def test_sampler_and_loss_alone(host):
     """Sampler and loss work with any model: here a grey image."""
     grey = torch.tensor(0.5, requires_grad=True)
     before = host["maps"].errors.clone()
     host |= {"view_ids": [0, 1], "model": lambda samples: grey.expand(len(samples), 3)}
-    host |= {"step": Step(3, 10, 10)} if document == DROP_IN else {}
-    code = block(document, language, "colors.backward")
-    if language == "python":  # leaves the model to the reader
-        draw = "samples = sampler.sample(maps, view_ids, rate, step)"
-        code = code.replace(draw, f"{draw}\ncolors, targets = model(samples), gather_pixels(photos, samples)\n#")
-    exec(code, host)
+    host |= {"step": Step(3, 10, 10)}
+    draw = "samples = sampler.sample(maps, view_ids, rate, step)"  # what follows leaves the model to the reader
+    drawn = f"{draw}\ncolors, targets = model(samples), gather_pixels(photos, samples)\n#"
+    exec(block(DROP_IN, "python", "colors.backward").replace(draw, drawn), host)
     assert grey.grad != 0
     assert_updated(host["maps"], before, host["samples"], host["loss"].pixel_errors)

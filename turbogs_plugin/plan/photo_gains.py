@@ -10,6 +10,7 @@ lines, although the nearest photo is always one of the same line.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import ReferenceType, ref
 
 import numpy as np
 import torch
@@ -80,6 +81,10 @@ class _Patches:
     stops: Floats
 
 
+_latest: tuple[ReferenceType[PosedImages], Tensor, PhotoGains] | None = None
+"""Photos and points that were compared last, and their gains: a plan asks for them, then the training's start."""
+
+
 def compare_exposures(views: PosedImages, points: Tensor) -> PhotoGains:
     """The gains of photos, by the surface points that they share.
 
@@ -89,6 +94,14 @@ def compare_exposures(views: PosedImages, points: Tensor) -> PhotoGains:
     Args:
         points: [M, 3], in the views' frame.
     """
+    global _latest
+    if _latest is None or _latest[0]() is not views or _latest[1] is not points:
+        _latest = ref(views), points, _compared(views, points)
+    return _latest[2]
+
+
+def _compared(views: PosedImages, points: Tensor) -> PhotoGains:
+    """`compare_exposures` of photos that were not compared last."""
     count = len(views)
     cameras = views.cameras.to("cpu", torch.float64)
     patches = _patches(views, points)
