@@ -13,6 +13,7 @@ from turbogs_plugin.config.sections import parse_bytes
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.plan.memory import (
     FEWEST_GAUSSIANS,
+    IMAGE_BYTES,
     MemoryDemand,
     cap_of,
     most_images,
@@ -87,21 +88,23 @@ def demand(*overrides: str) -> MemoryDemand:
 
 def test_memory_is_what_is_kept_and_what_is_done_with_it():
     resident, windows = (demand(f"train.pixels_place={place}") for place in ("device", "host"))
-    assert resident.per_gaussian == windows.per_gaussian == 2 * (59 * 4 * 3 + 4 + 32) + 230 * 10
+    assert resident.per_gaussian == windows.per_gaussian == 2 * (59 * 4 * 3 + 4 + 32) + 200 * 10
     assert resident.fixed - windows.fixed == (4 * (200 - 20) + 3 * (225 - 22)) * 8_294_400
     assert demand("train.sh_degree=0").per_gaussian == resident.per_gaussian - 2 * 45 * 12
 
 
 def test_no_measured_peak_is_above_the_prediction():
-    """Nor far below: the measured iterations have neither an event of density control nor an evaluation in them."""
+    """Nor far below. The measured iterations have neither an event of density control, whose new arrays stand beside the
+    old, nor an evaluation's whole image: these parts of the prediction are left out here."""
     report = json.loads((Path(__file__).parents[2] / "docs/lab/step-h200.json").read_text())
     assert len(report["passes"]) >= 4
     for entry in report["passes"]:
         fixed = ("schedule.type=fixed", f"schedule.views={entry['views']}", "train.sh_degree=3")
         sizes = np.full((report["training_views"], 2), report["image_size"])
         memory = MemoryDemand.of(load_config("turbogs", fixed), train_sizes=sizes, test_sizes=sizes[:0])
-        predicted = memory.fixed + memory.per_gaussian * entry["gaussians"]
-        assert 1.0 <= predicted / entry["memory_bytes"]["peak"] <= 1.6
+        event, image = (12 * 59 + 4 + 32) * entry["gaussians"], IMAGE_BYTES * int(sizes[0].prod())
+        predicted = memory.fixed + memory.per_gaussian * entry["gaussians"] - event - image
+        assert 1.0 <= predicted / entry["memory_bytes"]["peak"] <= 1.3
 
 
 @pytest.mark.parametrize("limit", [2**33, 2**34])

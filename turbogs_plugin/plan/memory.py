@@ -31,11 +31,11 @@ from turbogs_plugin.types import Step
 
 FEWEST_GAUSSIANS = 1000
 """Smallest number of Gaussians that can be a model of a capture."""
-VIEW_BYTES = 230
+VIEW_BYTES = 200
 """Bytes of a Gaussian in a view: the rasterizer's instance, radius and gradient record, and its share of the
-intersections. Measured on an H200: 213 between 150 and 600 thousand Gaussians."""
-SAMPLE_BYTES = 400
-"""Bytes of a sample: draw, colours, gradients, errors, masks of intersections, scratch. Measured there: 320 to 400."""
+intersections. Measured on an H200: 183 between 150 and 600 thousand Gaussians."""
+SAMPLE_BYTES = 280
+"""Bytes of a sample: draw, colours, gradients, errors, masks of intersections, scratch. Measured there: 150 to 240."""
 IMAGE_BYTES = 120
 """Bytes of a pixel of a whole render."""
 WHOLE_VIEWS = ("dense",)
