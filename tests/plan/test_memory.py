@@ -94,8 +94,8 @@ def test_memory_is_what_is_kept_and_what_is_done_with_it():
 
 
 def test_no_measured_peak_is_above_the_prediction():
-    """Nor far below. The measured iterations have neither an event of density control, whose new arrays stand beside the
-    old, nor an evaluation's whole image: these parts of the prediction are left out here."""
+    """Nor far below. The measured iterations have neither an event of density control, whose new arrays stand beside
+    the old, nor an evaluation's whole image: these parts of the prediction are left out here."""
     report = json.loads((Path(__file__).parents[2] / "docs/lab/step-h200.json").read_text())
     assert len(report["passes"]) >= 4
     for entry in report["passes"]:
