@@ -394,3 +394,12 @@ def test_poses_of_frames_that_images_contradict_are_said(tmp_path):
     images.write_text(moved(images.read_text()))
     scene = load_scene(folder)
     assert scene.doubt in scene.notes and scene.doubt.startswith("poses are of frames.txt, and ")
+
+
+def test_validation_photos_are_among_the_training_photos(capture):
+    whole = load_scene(capture, test_every=4)
+    chosen = load_scene(capture, test_every=4, validation=True)
+    assert chosen.test.names == whole.train.names[::4]
+    assert sorted((*chosen.train.names, *chosen.test.names)) == sorted(whole.train.names)
+    assert f"{len(whole.test)} test photos are left out" in "".join(chosen.notes)
+    assert len(chosen.points) == len(whole.points)

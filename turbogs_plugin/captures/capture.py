@@ -111,9 +111,9 @@ class Capture:
             if not finite.any():
                 raise InputError(f"{source}: none of {len(self.points)} 3D points is finite: {AGAIN}")
             notes.append(f"{(~finite).sum()} of {len(self.points)} points are left out, as they are not finite")
-        return self._with(np.flatnonzero(whole), np.flatnonzero(finite), tuple(notes)) if notes else self
+        return self.subset(np.flatnonzero(whole), np.flatnonzero(finite), tuple(notes)) if notes else self
 
-    def _with(self, views: np.ndarray, points: np.ndarray, notes: tuple[str, ...]) -> Capture:
+    def subset(self, views: np.ndarray, points: np.ndarray, notes: tuple[str, ...]) -> Capture:
         """Some views and points, both ascending, and more notes."""
         shown = self.observations
         if shown is not None:

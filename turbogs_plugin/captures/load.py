@@ -48,6 +48,7 @@ def load_scene(
     factor: int = 1,
     test_every: int = 8,
     progress: Callable[[int, int], object] | None = None,
+    validation: bool = False,
 ) -> Scene:
     """Load a capture with its photos.
 
@@ -63,6 +64,7 @@ def load_scene(
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
             Captures with a split of their own (NeRF-synthetic, lists in a ``transforms.json``) keep it.
+        validation: leave the test views out, and test on the first of each `test_every` of the others.
         progress: called with the number of photos decoded so far, and of all.
 
     Raises:
@@ -75,6 +77,11 @@ def load_scene(
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
         capture = _with_points(read_capture(scene))
     test = _test_views(scene, capture, test_every)
+    if validation:
+        note = f"{test.sum()} test photos are left out: photos that choose settings are among the others"
+        capture = capture.subset(np.flatnonzero(~test), np.arange(len(capture.points)), (note,))
+        capture = replace(capture, test=None)
+        test = _test_views(scene, capture, test_every)
     frame, viewmats, points = _normalised(scene, capture, test)
     files = _find_photos(scene, capture, factor)
     mask_files, mask_note = find_masks(scene, capture, files.paths)

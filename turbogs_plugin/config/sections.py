@@ -42,17 +42,24 @@ class SceneConfig:
         path: folder of the capture; the command line sets it.
         factor: divisor of the photos' width and height.
         test_every: every n-th photo in name order tests.
+        validation: leave the test photos out, and test on every n-th of the others: for whoever chooses settings.
         force: train also where cameras, points and photos contradict each other (`turbogs_plugin.scene.agreement`).
     """
 
     path: str = ""
     factor: int = 1
     test_every: int = 8
+    validation: bool = False
     force: bool = False
 
     def __post_init__(self) -> None:
         require(self.factor >= 1, "factor", self.factor, "at least 1")
         require(self.test_every >= 2, "test_every", self.test_every, "at least 2")
+
+    @property
+    def photos(self) -> tuple[int, int, bool]:
+        """Settings that decide which photos of a capture train and test, and how large they are."""
+        return self.factor, self.test_every, self.validation
 
 
 @dataclass

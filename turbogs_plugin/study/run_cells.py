@@ -78,7 +78,7 @@ class CellChoice:
             config.scene.path, config.train.device = str(path), resolve_device(self.device).type
             configs[CellKey(path.name, variant, seed)] = config
             shared = next(iter(configs.values())).scene
-            if (config.scene.factor, config.scene.test_every) != (shared.factor, shared.test_every):
+            if config.scene.photos != shared.photos:
                 raise InputError(f"variant '{variant}' changes the scene's photos, which all variants share")
         return configs
 

@@ -42,7 +42,7 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
         settings = flat_settings(folder.read_asked().to_mapping())
         shared = {key: value for key, value in settings.items() if not key.startswith(UNSHARED)}
         shared["train.device"] = config.train.device  # where it was trained
-        place = (Path(config.scene.path), config.scene.factor, config.scene.test_every)
+        place = (Path(config.scene.path), *config.scene.photos)
         curve, final = curve_and_final(history)
         wall = WallRecord.read(folder.wall)
         final |= measured({"wall_seconds": wall.wall_seconds if wall else None})

@@ -59,7 +59,8 @@ def open_scene(settings: SceneConfig, refine: bool, ranks: Ranks = ONE, trained:
     Raises:
         InputError: there is no usable capture, or no training on it can work.
     """
-    scene = load_scene(settings.path, settings.factor, settings.test_every, show_loading if ranks.first else None)
+    progress = show_loading if ranks.first else None
+    scene = load_scene(settings.path, settings.factor, settings.test_every, progress, settings.validation)
     if not (settings.force or trained):
         require_agreement(scene)
     if note := unseeing_note(scene):
