@@ -72,7 +72,7 @@ STILL_LARGER = {
     ),
     "turbogs_plugin/scene": (1_165, "cameras that see no point are named"),
     "turbogs_plugin/{config,plan}": (
-        1_579,
+        1_599,
         "a run's configuration runs no foreign code; memory that does not fit is said before",
     ),
     "turbogs_plugin/train": (2_501, "a lock on the run's folder, checkpoints by time, a retry where memory is full"),
