@@ -50,7 +50,7 @@ class RandomViewSampler:
 
     Views come from a shuffled stack. Drawn views leave it, and it is filled again when fewer than K are left. Doubted
     photos (`doubted`) come onto it in one of five rounds, which 3DGS has not: one wrong pose among 37 costs .10 dB
-    without, and nothing with it; four cost 1.31 and .31 dB (fox, validation photos, two seeds, 1.5 times and 5 spreads).
+    without, and nothing with it; four cost 1.31 and .31 dB (fox, two seeds, from 1.5 times and 5 spreads on).
     """
 
     stack: np.ndarray = field(init=False, repr=False, compare=False)  # the views left, int64
