@@ -20,7 +20,7 @@ from turbogs_plugin.train.session import RunSession
 
 DOUBTED = """
 The model does not explain these training photos as it does the others: look for a wrong pose, a passer-by, blur or
-another light. Training took each in one of five rounds."""
+another light. The view sampler `random` takes each in one of five rounds."""
 
 
 def write_report(run: RunSession) -> Path:
