@@ -14,7 +14,7 @@ from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.train import run
 
-CONFIGS = ("turbogs", "3dgs", "3dgs-as-shipped", "fastgs", "mcmc")
+CONFIGS = ("turbogs", "3dgs", "3dgs-as-shipped", "mcmc")
 
 
 def main(scene: str = "", output: str = "", iterations: int = 300, configs: tuple[str, ...] = CONFIGS) -> None:

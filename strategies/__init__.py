@@ -46,7 +46,6 @@ TYPES = {
         "none": "density.rows:NoDensity",
         "gsplat_default": "density.gsplat_default:GsplatDefaultDensity",
         "mcmc": "density.mcmc:GsplatMcmcDensity",
-        "fastgs": "density.fastgs:FastGsDensity",
     },
     "optimizer": {
         "moment_lm": "optimizers.moment_lm:MomentLMOptimizer",

@@ -7,7 +7,7 @@ it as plain tensors and numbers.
 
 from __future__ import annotations
 
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from torch import Tensor
@@ -97,11 +97,10 @@ class DensityController(Protocol):
     A class that inherits from this one and keeps no state per Gaussian needs only `update`.
 
     Attributes:
-        watched: what `update` reads or changes at every iteration, not only at events (`event_due`): the ``model``, the
-            ``statistics``, both or nothing.
+        moves_model: `update` changes the model between events (`event_due`), too.
     """
 
-    watched: tuple[Literal["model", "statistics"], ...] = ()
+    moves_model: bool = False
 
     @property
     def stats(self) -> GaussianStats | None:
@@ -115,13 +114,11 @@ class DensityController(Protocol):
         """Propose a change of the set of Gaussians, or None. Called after every optimizer step."""
 
     def event_due(self, step: Step) -> bool:
-        """True where `update` may return a change at this iteration, or looks at more than is `watched`; on every
-        process alike.
+        """True where `update` may return a change or looks at the statistics; on every process alike.
 
-        Where several processes train one model, each adds to the statistics of its own rows, and makes the step of its
-        own rows of the model. Only at such an iteration are both complete when `update` is called, beside what is
-        `watched`, and the hosts of all processes wait for each other. True where nothing is known, which is never
-        wrong.
+        Where several processes train one model, each adds to the statistics of its own rows. Only at such an iteration
+        are all complete when `update` is called, and the hosts of all processes wait for each other. True where nothing
+        is known, which is never wrong.
         """
         return True
 

@@ -108,7 +108,7 @@ def test_baselines(example, thin_capture, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     said = {line.split(":")[0] for line in lines if " dB, " in line}
     gpu = torch.cuda.is_available()
-    assert said == {"turbogs", "3dgs", "3dgs-as-shipped", "fastgs", *(["mcmc"] if gpu else [])}
+    assert said == {"turbogs", "3dgs", "3dgs-as-shipped", *(["mcmc"] if gpu else [])}
     assert ("mcmc: left out, needs a GPU" in lines) != gpu
     for name in said:  # short as they are, the runs have events of density control
         history = read_history(tmp_path / "runs" / name / "history.jsonl")

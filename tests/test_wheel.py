@@ -45,7 +45,7 @@ def library(numbers: list[str]) -> bytes:
 def wheel(folder: Path, content: bytes, name: str = NAME, stray: str | None = None) -> Path:
     with zipfile.ZipFile(folder / name, "w") as archive:
         mark = "turbogs_plugin/py.typed"
-        for file in ("turbogs_plugin/cli.py", "turbogs_plugin/configs/ablations/far_sizes.yaml", mark, stray):
+        for file in ("turbogs_plugin/cli.py", "turbogs_plugin/configs/ablations/parts.yaml", mark, stray):
             if file:
                 archive.writestr(file, "")
         archive.writestr("turbogs_plugin-0.1.0.dist-info/WHEEL", "")

@@ -50,7 +50,7 @@ class GsplatMcmcDensity(DensityController):
     refine_start_iter: int = MCMCStrategy.refine_start_iter
     refine_every: int = MCMCStrategy.refine_every
     learning_rates: LearningRates = field(default_factory=LearningRates)
-    watched = ("model",)  # its noise
+    moves_model = True  # its noise
 
     def __post_init__(self) -> None:
         require_at_least_one(self, "max_gaussians", "refine_every")

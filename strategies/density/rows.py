@@ -62,7 +62,9 @@ class WindowedDensity(DensityController):
         if state["stats"] is None:  # after the last event
             self.stats = None
         else:
-            load_rows("stats", self.window, state["stats"])
+            check_state(state["stats"], vars(self.window), "density stats")
+            for name, value in vars(self.window).items():
+                value.copy_(state["stats"][name])
 
 
 def add_stats(window: GaussianStats, new: GaussianStats) -> None:
@@ -73,20 +75,6 @@ def add_stats(window: GaussianStats, new: GaussianStats) -> None:
             torch.maximum(total, value, out=total)
         else:
             total += value
-
-
-def load_rows(name: str, rows: Any, saved: dict[str, Tensor]) -> None:
-    """Copy saved arrays over Gaussians into a dataclass of [N] tensors.
-
-    Args:
-        name: of the part, for the error message.
-
-    Raises:
-        InputError: an array is missing, or of another number of Gaussians.
-    """
-    check_state(saved, vars(rows), f"density {name}")
-    for key, value in vars(rows).items():
-        value.copy_(saved[key])
 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:

@@ -28,7 +28,6 @@ from turbogs_plugin.engine import Engine
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.torch_file import leaves
-from turbogs_plugin.strategies.density import fastgs
 from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")
@@ -40,11 +39,6 @@ CASES = {
     "tiles": ("pixel_sampler.unit=tile", "pixel_sampler.importance=0.5"),
     "summed rows": ("optimizer.rows=summed",),
     "no rule": ("optimizer.type=adam",),
-    # Its votes have a threshold, so the models must not part: a step where a gradient is only rounding has its sign.
-    "fastgs": (
-        *("density.type=fastgs", "density.refine_from=2", "density.refine_every=3"),
-        "optimizer.learning_rates.batch_scale=1e-4",
-    ),
     "exposures": ("train.exposure=true", "train.background=random", "train.average_last=1.0"),
     "dropout": ("train.dropout=0.3",),
     "masked": ("schedule.min_views=7", "schedule.max_views=7"),
@@ -53,7 +47,7 @@ CASES = {
     "all records": (),
 }
 """Name -> overrides. A masked case is of the capture with masks. In all but the last one rows have owners."""
-WITH_EVENTS = ("usual", "fastgs", "all records")
+WITH_EVENTS = ("usual", "all records")
 GO_ON = (*WITH_EVENTS, "no rule", "exposures", "masked", "hosted")
 """What these have beside the model changes from step to step; of the others, the first step says all."""
 
@@ -75,8 +69,7 @@ scene_of = cache(load_scene)  # a trainer only reads it
 
 def case_of(capture: Path, name: str, ranks: Ranks = ONE) -> Trainer:
     place = capture.parent / "masked" if name.startswith("masked") else capture
-    with patch.object(fastgs, "ABSGRAD_THRESHOLD", 0.0):  # what its batches mark is densified
-        return trainer_of(place, *CASES[name], ranks=ranks)
+    return trainer_of(place, *CASES[name], ranks=ranks)
 
 
 def trainer_of(capture: Path, *overrides: str, ranks: Ranks = ONE, engine: Engine | None = None) -> Trainer:

@@ -16,7 +16,6 @@ SOON = {
     "3dgs": ("density.refine_start_iter=9", "density.refine_every=10"),
     "3dgs-as-shipped": ("density.refine_start_iter=9", "density.refine_every=10"),
     "mcmc": ("density.refine_start_iter=9", "density.refine_every=10", "density.max_gaussians=2000"),
-    "fastgs": ("density.refine_from=10", "density.refine_every=10"),
 }
 
 

@@ -85,7 +85,6 @@ def test_runs_of_rows_make_the_step_of_all_rows(optimizer, unit):
 
 
 OTHERS = {
-    "fastgs": ("density.type=fastgs", "density.refine_from=20", "density.refine_every=20"),
     "mcmc": ("density.type=mcmc", "density.refine_start_iter=20", "density.refine_every=20"),
     "masked": ("density.refine_from=20", "density.refine_every=20"),
     "larger batch": ("density.refine_from=20", "density.refine_every=20", "train.batch_for=auto"),

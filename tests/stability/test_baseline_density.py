@@ -16,8 +16,6 @@ from helpers.optimizers import all_finite, clone, fill, make_gaussians, random_s
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbogs_plugin.strategies.density import fastgs as fastgs_density
-from turbogs_plugin.strategies.density.fastgs import FastGsDensity
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
 from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 from turbogs_plugin.strategies.learning_rates import LearningRates
@@ -52,16 +50,7 @@ def gsplats_ops_on_cpu(monkeypatch):
     monkeypatch.setattr(ops, "quat_scale_to_covar_preci", covariances_on_cpu)
 
 
-@pytest.fixture(autouse=True)
-def fastgs_prunes_at_each_interval(monkeypatch):
-    monkeypatch.setattr(fastgs_density, "PRUNE_EVERY", 1)
-
-
-def fastgs(**options) -> FastGsDensity:
-    return FastGsDensity(**{"refine_from": 100, "refine_every": 100, **options})
-
-
-MAKERS = {"gsplat_default": GsplatDefaultDensity, "fastgs": fastgs, "mcmc": GsplatMcmcDensity}
+MAKERS = {"gsplat_default": GsplatDefaultDensity, "mcmc": GsplatMcmcDensity}
 
 
 def controller(name: str, gaussians: Gaussians, stats: GaussianStats | None = None, **options):
@@ -101,27 +90,6 @@ def test_everything_is_due_to_go(name, step):
     else:
         assert result.sh0[:, 0, 0].tolist() == [5.0]
     assert all_finite(result)
-
-
-@pytest.mark.parametrize("bad", BROKEN)
-def test_a_look_that_is_not_finite_spoils_no_vote(bad):
-    """Gaussian 0 stands out, 1 has an error that is not finite: 0 is marked as ever, 1 was not seen."""
-    gaussians = make_gaussians(10, dtype=torch.float32)
-    density = controller("fastgs", gaussians)
-    density.stats.weight_sums.fill_(1.0)
-    density.stats.error_sums[:] = torch.tensor([0.9, bad] + [0.1] * 8)
-    density.update(gaussians, Step(601, 5000, 3500))
-    assert density._votes.marked.tolist() == [1.0] + [0.0] * 9
-    assert density._votes.seen.tolist() == [1.0, 0.0] + [1.0] * 8
-    assert density._votes.blame.isfinite().all()
-
-
-def test_late_pruning_removes_what_is_not_finite():
-    gaussians = make_gaussians(10, dtype=torch.float32)
-    gaussians.opacities[:] = 1.0
-    gaussians.quats[4, 1] = float("nan")
-    result = follow(controller("fastgs", gaussians), gaussians, LATE)
-    assert result.sh0[:, 0, 0].tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
 
 
 @pytest.mark.parametrize("name", MAKERS)

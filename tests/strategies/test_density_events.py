@@ -9,7 +9,6 @@ from helpers.optimizers import fill, make_gaussians, random_stats
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
-from turbogs_plugin.strategies.density.fastgs import FastGsDensity
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
 from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
 from turbogs_plugin.strategies.density.rows import NoDensity
@@ -26,12 +25,11 @@ def error_driven(**options) -> ErrorDrivenDensity:
 MAKERS = {
     "error_driven": error_driven,
     "no final": lambda: ErrorDrivenDensity(refine_from=5, refine_every=4, final_keep=1.0),
-    "fastgs": lambda: FastGsDensity(refine_from=5, refine_every=4),
     "mcmc": lambda: GsplatMcmcDensity(refine_start_iter=5, refine_every=4),
     "gsplat_default": lambda: GsplatDefaultDensity(refine_start_iter=5, refine_every=4),
     "none": NoDensity,
 }
-EXACT = ("error_driven", "no final", "fastgs", "mcmc", "none")
+EXACT = ("error_driven", "no final", "mcmc", "none")
 """Every event of theirs changes something here."""
 WITHOUT_LATER_EVENTS = ("no final", "mcmc", "gsplat_default", "none")
 """None of theirs comes after densification has ended."""
@@ -65,7 +63,7 @@ def model() -> Gaussians:
 
 @pytest.mark.parametrize("name", MAKERS)
 def test_events_are_where_it_says(name):
-    """Over a whole run. Between events nothing but what is watched is looked at, and nothing is changed."""
+    """Over a whole run. Between events nothing is looked at but a model that is moved, and nothing is changed."""
     density = MAKERS[name]()
     if name != "mcmc":  # which has no state, and refuses a CPU
         density.setup(model())
@@ -73,10 +71,10 @@ def test_events_are_where_it_says(name):
     for iteration in range(TOTAL):
         step = Step(iteration, TOTAL, REFINE_UNTIL, seed=3)
         due, stats = density.event_due(step), density.stats
-        given = model() if due or "model" in density.watched else Untouchable()
+        given = model() if due or density.moves_model else Untouchable()
         if stats is not None:
             fill(stats, random_stats(COUNT, seed=iteration))
-        hidden = stats is not None and not due and "statistics" not in density.watched
+        hidden = stats is not None and not due
         if hidden:
             density.stats = Untouchable()
         update = density.update(given, step)
@@ -94,13 +92,13 @@ def test_events_are_where_it_says(name):
         assert max(said, default=0) <= REFINE_UNTIL
 
 
-def test_the_noise_of_mcmc_is_why_it_watches_the_model(monkeypatch):
+def test_the_noise_of_mcmc_is_why_it_moves_the_model(monkeypatch):
     gaussians, density = model(), GsplatMcmcDensity()
     round_ones = lambda quats, scales, **_: (torch.eye(3).expand(len(scales), 3, 3), None)  # noqa: E731
     monkeypatch.setattr(ops, "quat_scale_to_covar_preci", round_ones)
     before, step = gaussians.means.clone(), Step(1, TOTAL, REFINE_UNTIL)
     assert not density.event_due(step) and density.update(gaussians, step) is None
-    assert not torch.equal(gaussians.means, before) and density.watched == ("model",)
+    assert not torch.equal(gaussians.means, before) and density.moves_model
 
 
 def test_an_event_ends_a_window_whether_it_changes_anything_or_not():

@@ -61,7 +61,7 @@ def test_what_a_variant_does_not_name_is_as_in_the_base(name):
         assert changed <= DEFAULTS_THAT_DIFFER.get(variant, set()), variant
 
 
-DEFAULTS_THAT_DIFFER = {"3dgs": {"optimizer.learning_rates.final_factor"}, "fastgs": {"density.refine_every"}}
+DEFAULTS_THAT_DIFFER = {"3dgs": {"optimizer.learning_rates.final_factor"}}
 """A type's own values, where a variant is meant to have them."""
 
 

@@ -105,7 +105,7 @@ def test_statistics_are_written_once_whatever_the_optimizer_does(capture, calls)
 class Restless:
     """A density control that moves every mean in each iteration, without a change of the set of Gaussians."""
 
-    watched, stats = ("model",), None
+    moves_model, stats = True, None
 
     def setup(self, gaussians):
         pass

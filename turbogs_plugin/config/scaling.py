@@ -50,7 +50,7 @@ Gaussians: Grendel, Zhao et al. 2024)."""
 
 MOMENT_FIELDS = ("beta1", "beta2")
 """Decays of an optimizer's moments, raised to the power of the batch: moments then forget after a number of samples,
-not of iterations (Grendel). Measured by `configs/ablations/batch.yaml`."""
+not of iterations (Grendel)."""
 
 
 def with_batch_for(config: Config, processes: int) -> Config:

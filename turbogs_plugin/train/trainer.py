@@ -142,10 +142,10 @@ class Trainer(TrainingState):
         What changes the model without such a change (mcmc's noise) is taken back in a skipped iteration, which is made
         again (`Engine.overflow`).
         """
-        due, watched, overflow = self.density.event_due(step), self.density.watched, self.engine.overflow
-        if due or "statistics" in watched:
-            self.engine.complete(self.optimizer.moments if due else None, self.density.stats)
-        before = self.gaussians.map(Tensor.clone) if overflow is not None and "model" in watched else None
+        due, overflow = self.density.event_due(step), self.engine.overflow
+        if due:
+            self.engine.complete(self.optimizer.moments, self.density.stats)
+        before = self.gaussians.map(Tensor.clone) if overflow is not None and self.density.moves_model else None
         update = self.density.update(self.gaussians, step)
         if overflow is not None and before is not None and update is None:
             kept = overflow.eq(0)
