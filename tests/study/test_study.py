@@ -6,8 +6,6 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.config.scaling import with_iterations
@@ -15,7 +13,7 @@ from turbogs_plugin.config.sections import WRITTEN_FOR
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.grid import PACKAGE, Ablation, load_ablation, variant_config
 from turbogs_plugin.study.results import CellResult, Study, curve_and_final
-from turbogs_plugin.study.statistics import Difference, Spread, mean_curve, pareto_front, seconds_to_reach, summarise
+from turbogs_plugin.study.statistics import Difference, Spread, mean_curve, seconds_to_reach, summarise
 from turbogs_plugin.study.study_report import report_text
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.yaml_json import packaged_names
@@ -194,14 +192,6 @@ def test_a_mean_curve_pairs_evaluations_in_their_order_and_the_ends():
     np.testing.assert_array_equal(mean_curve([first], "psnr")[1], np.zeros((2, 3)))
 
 
-@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=1, max_size=12))
-def test_the_front_is_what_nothing_beats(points):
-    front = pareto_front([(float(x), float(y)) for x, y in points])
-    for (seconds, quality), on_front in zip(points, front, strict=True):
-        beaten = any(x <= seconds and y >= quality and (x < seconds or y > quality) for x, y in points)
-        assert on_front is not beaten
-
-
 def test_a_summary_of_known_numbers():
     study = Study(
         Ablation("x", {"base": [], "fast": [], "slow": []}),
@@ -220,7 +210,6 @@ def test_a_summary_of_known_numbers():
     assert (base.spread("seconds").mean, base.spread("gaussians").mean) == (11.0, 1100.0)
     assert fast.difference("psnr").mean == pytest.approx(0.9) and fast.ratio("seconds") == pytest.approx(5.0 / 11.0)
     assert fast.difference("psnr").standard_error == pytest.approx(0.1)
-    assert [row.on_front for row in summary.rows] == [False, True, False]
     of_base = (10.0 * 10 / 20.0 + 12.0 * 10 / 20.2) / 2
     assert np.mean(base.seconds_to(20.0)) == pytest.approx(of_base) and base.ratio_to(20.0) == pytest.approx(1.0)
     assert fast.ratio_to(20.0) == pytest.approx(5.0 * 10 / 21.0 / of_base)

@@ -24,8 +24,8 @@ from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.train.trainer import Trainer
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
-"""Iterations of warm-up: the configuration is scaled to this length and trained once before the clock starts, so that
-the code of every kind of step is loaded. One for a variant and capture in each process: what is loaded stays."""
+"""Length to which the configuration is scaled for the warm-up before the clock starts, which loads the code of every
+kind of step. One for a variant and capture in each process: what is loaded stays."""
 
 
 def capture_digest(scene: Scene) -> str:
@@ -49,10 +49,8 @@ def train_cell(
     """Train one variant, as `turbogs train` would: by a plan for the scene, within the configuration's budgets.
 
     Args:
-        variant: its name.
         config: as asked for.
         scene: in host memory; the plan says what of it goes to the device.
-        device: where to train.
         made_by: machine and sources, as they were when the process began.
         loading: seconds in which the scene was loaded; NaN: not known, and then the cell's own seconds are not.
         warm: this process has trained a cell of this variant on this capture.
@@ -69,17 +67,15 @@ def train_cell(
     if not warm:
         warm_up(planned, scene, test, device)
     clock.mark("warm-up")
-    loop = new_loop(planned, scene, device)
+    loop, evaluations = new_loop(planned, scene, device), Evaluations(test)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    evaluations = Evaluations(test)
     loop.listeners = [evaluations]
     loop.run()
     clock.mark("cell")
     trainer, (curve, final) = loop.trainer, curve_and_final(evaluations.history)
-    if evaluations.metrics is not None:
-        final["fps"] = evaluations.metrics.fps
-    final["cell_seconds"] = loading + clock.parts["cell"]
+    assert evaluations.metrics is not None, "a run ends with an evaluation"
+    final |= {"fps": evaluations.metrics.fps, "cell_seconds": loading + clock.parts["cell"]}
     if device.type == "cuda":  # a CPU's peak is the process's, of the largest cell so far
         final["peak_mib"] = evaluations.history[-1].memory_bytes / 2**20
     if lpips is not None:  # off the clock

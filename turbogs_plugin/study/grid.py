@@ -36,7 +36,7 @@ class Ablation:
     Args:
         title: heading of the report.
         variants: name -> overrides ``section.key=value`` of the base configuration. Names become file names.
-        base: a packaged configuration or a YAML file; `load_ablation` looks for the file beside the ablation's.
+        base: a packaged configuration, or a YAML file beside the ablation's.
         baseline: the variant that the others are compared with; the first one where empty.
         notes: name -> what a reader should know of a variant.
     """
@@ -63,7 +63,7 @@ class Ablation:
             raise InputError(f"no variant '{name}': {nearest(name, self.variants)}")
 
     def only(self, names: Sequence[str]) -> list[str]:
-        """Names of these variants and the baseline, in the ablation's order; of all variants where none is given."""
+        """These variants and the baseline, in the ablation's order; all where none is given."""
         for name in names:
             self.require_variant(name)
         return [name for name in self.variants if not names or name in (*names, self.baseline)]
@@ -71,7 +71,7 @@ class Ablation:
 
 @dataclass(frozen=True)
 class CellKey:
-    """Name of a cell. `scene` is the capture's name."""
+    """Name of a cell: of its capture, variant and seed."""
 
     scene: str
     variant: str
@@ -109,18 +109,12 @@ def variant_config(ablation: Ablation, variant: str, seed: int, overrides: Seque
     """
     try:
         config = load_config(ablation.base, [*ablation.variants[variant], *overrides, f"train.seed={seed}"])
+        if config.budget.max_memory:
+            limits = "budget.max_memory limits a whole process, which here trains all cells"
+            raise InputError(f"{limits}: leave it out, or limit density.max_gaussians")
+        if steps is not None and config.budget.time:
+            both = f"--steps {steps} and the time budget {config.budget.time}"
+            raise InputError(f"{both} exclude each other: leave one out")
     except InputError as error:
         raise InputError(f"variant '{variant}': {error}") from None
-    if config.budget.max_memory:
-        raise InputError(
-            f"variant '{variant}': budget.max_memory limits a whole process, which here trains all cells: leave it "
-            "out, or limit density.max_gaussians"
-        )
-    if steps is None:
-        return config
-    if config.budget.time:
-        raise InputError(
-            f"variant '{variant}': --steps {steps} and the time budget {config.budget.time} exclude each other: "
-            "leave one out"
-        )
-    return with_iterations(config, steps)
+    return config if steps is None else with_iterations(config, steps)

@@ -1,9 +1,8 @@
 """What the cells of a study gave, and the files that keep it.
 
-A folder of a study has ``results.json``, from which its page is made, and while cells are trained a file for each,
-``cells/SCENE/VARIANT--seedN.json``, written when the cell ends: whatever stops the process, no finished cell is lost.
-Both are plain JSON of one form. Settings are flat there, ``section.key`` -> value: ``settings`` has the first cell's,
-and each cell what is different in its own, null for a setting that it has not.
+A folder of a study has ``results.json``, from which its page is made, and ``cells/SCENE/VARIANT--seedN.json``, written
+when a cell ends: whatever stops the process, no finished cell is lost. Both are JSON of one form. Settings are flat
+there, ``section.key`` -> value: ``settings`` has the first cell's, and each cell what is different in its own.
 """
 
 from __future__ import annotations
@@ -46,15 +45,13 @@ class CellResult:
     Args:
         scene, variant, seed: which cell.
         capture: `capture_digest` of the capture; "" where it was not recorded.
-        provenance: machine, versions and commit; None where they were not recorded.
-        settings: the configuration that was asked for, flat.
-        planned: settings that plan and budgets made of it, where they differ.
+        provenance: None where it was not recorded.
+        settings: the configuration that was asked for, flat; `planned`: what plan and budgets changed of it.
         curve: column, of `CURVE`, -> [E] its values at the evaluations, in the order of training.
-        final: measure -> value of the final model: the curve's last values; ``worst_psnr`` of the worst test view;
-            ``refined_psnr`` and ``refined_ssim`` by refined test cameras; ``lpips``; ``fps``, test views
-            rendered a second; ``peak_mib``, peak of the GPU's tensors while training; ``wall_seconds`` of a run, from
-            its process's start until its model was written; ``cell_seconds`` of a cell: loading its capture, plan,
-            training and evaluations. Measures that were not taken are absent.
+        final: measure -> value of the final model, where it was taken: the curve's last values; the others of `LAST`;
+            ``lpips``; ``fps``, test views rendered a second; ``peak_mib``, peak of the GPU's tensors while training;
+            ``wall_seconds`` of a run, from its process's start until its model was written; ``cell_seconds`` of a cell:
+            loading its capture, plan, training and evaluations.
         lpips_reason: why LPIPS was not computed; empty where it was.
     """
 
@@ -73,20 +70,10 @@ class CellResult:
     def key(self) -> CellKey:
         return CellKey(self.scene, self.variant, self.seed)
 
-    def text(self) -> str:
-        """``31.20 dB in 4.7 s, 150000 Gaussians``."""
-        psnr, seconds = self.final.get("psnr", math.nan), self.final["seconds"]
-        return f"{psnr:.2f} dB in {seconds:.1f} s, {self.final['gaussians']} Gaussians"
-
 
 @dataclass
 class Study:
-    """An ablation with the results of its cells.
-
-    Args:
-        ablation: title, variants, baseline.
-        results: finished cells: captures in the order of their names, variants in the ablation's, seeds ascending.
-    """
+    """An ablation with its finished cells: captures by name, variants in the ablation's order, seeds ascending."""
 
     ablation: Ablation
     results: list[CellResult]
@@ -119,10 +106,8 @@ def measured(values: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def flat_settings(mapping: Mapping[str, Any], place: str = "") -> dict[str, Any]:
-    """``section.key`` -> value of a nested configuration (`Config.to_mapping`), without what is null.
-
-    The capture's path becomes its name: where a capture lies is no part of a result.
-    """
+    """``section.key`` -> value of a nested configuration (`Config.to_mapping`), without what is null, and with the
+    capture's name for its path: where a capture lies is no part of a result."""
     flat: dict[str, Any] = {}
     for key, value in mapping.items():
         path = f"{place}.{key}" if place else key
@@ -140,7 +125,7 @@ def changes(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
 
 
 def with_changes(common: Mapping[str, Any], changed: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings whose `changes` from `common` these are."""
+    """Settings that have these `changes` from `common`."""
     return {path: value for path, value in {**common, **changed}.items() if value is not None}
 
 
@@ -162,25 +147,21 @@ class StudyFolder:
         """Keep a cell's result, as a study of that cell alone."""
         path = self.cells / result.key.file
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_text_atomically(
-            path, _text(Study(Ablation(title=str(result.key), variants={result.variant: []}), [result]))
-        )
+        ablation = Ablation(title=str(result.key), variants={result.variant: []})
+        write_text_atomically(path, _text(Study(ablation, [result])))
 
     @contextmanager
     def claimed(self, key: CellKey) -> Iterator[bool]:
-        """Whether the cell is this process's to train while entered: no other process holds it.
-
-        The system frees the lock of a process that is killed.
-        """
+        """Whether the cell is this process's to train while entered. The system frees a killed process's lock."""
         path = (self.cells / key.file).with_suffix(".lock")
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             lock = FileLock(path, blocking=False).acquire()
         except Timeout:
             yield False
-            return
-        with lock:
-            yield True
+        else:
+            with lock:
+                yield True
 
     def write_study(self, study: Study) -> None:
         """Write ``results.json``."""
@@ -199,9 +180,8 @@ class StudyFolder:
         parts = [study, *(_parsed(path) for path in self.cells.glob("*/*.json"))]
         found = {result.key: result for part in parts for result in part.results}
         order = {name: number for number, name in enumerate(study.ablation.variants)}
-        for key in found:
-            if key.variant not in order:
-                raise InputError(f"'{self.path}' has a cell of another ablation ({key}): choose a new --out")
+        if strange := [key for key in found if key.variant not in order]:
+            raise InputError(f"'{self.path}' has a cell of another ablation ({strange[0]}): choose a new --out")
         results = sorted(found.values(), key=lambda result: (result.scene, order[result.variant], result.seed))
         return Study(study.ablation, results)
 

@@ -7,6 +7,7 @@ stopped at any moment and made again until all cells are there, and several call
 from __future__ import annotations
 
 import itertools
+import math
 import multiprocessing
 import os
 import sys
@@ -40,16 +41,7 @@ OF_A_CALL = ("train.device", "train.batch_for", "report.")
 
 @dataclass(frozen=True)
 class CellChoice:
-    """What a call of a study trains.
-
-    Args:
-        scenes: folders of captures, of different names.
-        seeds: of each variant.
-        only: variants to train, and the baseline; all where empty.
-        overrides: ``section.key=value`` for all variants.
-        steps: iterations of every cell; None: the configurations' own.
-        device: auto, cpu or cuda.
-    """
+    """What a call of a study trains: the options of `turbogs ablate`."""
 
     scenes: Sequence[Path]
     seeds: Sequence[int] = (0,)
@@ -59,11 +51,7 @@ class CellChoice:
     device: str = "auto"
 
     def configs(self, ablation: Ablation) -> dict[CellKey, Config]:
-        """Configuration of each cell, capture after capture and seed after seed.
-
-        Raises:
-            InputError: a configuration is wrong, captures or seeds are alike, or a variant has other photos.
-        """
+        """Configuration of each cell, capture after capture and seed after seed. Raises `InputError`."""
         paths = [path.resolve() for path in self.scenes]
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
             raise InputError(f"seeds: one or more different ones are needed, got {list(self.seeds)}")
@@ -84,10 +72,8 @@ class CellChoice:
 
 
 def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | None = None) -> list[str]:
-    """Train the cells that a study's folder has not yet, and write its report; a line for each cell that broke.
-
-    A cell that breaks leaves no file and the others go on; the next call tries it again. The report is written where
-    the call is interrupted, too, of what is there.
+    """Train the cells that a study's folder has not yet, and write its report, also where the call is interrupted; a
+    line for each cell that broke. Such a cell leaves no file, the others go on, and the next call tries it again.
 
     Args:
         gpus: number of this machine's GPUs, a process each; None: this process trains.
@@ -115,9 +101,6 @@ def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | Non
 def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, here: Provenance) -> list[str]:
     """Train, in this process, the cells that the folder has not and no other process trains; what broke.
 
-    Args:
-        here: machine and sources, as they were when the call began.
-
     Raises:
         InputError: a capture cannot be read, or is another one than the finished cells'.
     """
@@ -142,7 +125,8 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
             else:
                 warm.add((key.variant, key.scene))
                 folder.write(result)
-                said = f"{key}: {result.text()}"
+                psnr, end = result.final.get("psnr", math.nan), result.final
+                said = f"{key}: {psnr:.2f} dB in {end['seconds']:.1f} s, {end['gaussians']} Gaussians"
             # One write with the end of the line, or the lines of two processes would stand on one.
             print(f"[{number}/{len(configs)}] {said}\n", end="", file=sys.stderr, flush=True)
     return broken

@@ -24,8 +24,7 @@ UNSHARED = ("scene.", "report.", "train.seed", "train.checkpoint_every", "train.
 def study_of_runs(paths: Sequence[Path]) -> Study:
     """The runs as cells of a study. A variant has the name of its first run; the first run's variant is the baseline.
 
-    Runs are of one variant where they were asked for equal settings. What plan and budgets make of these does not
-    count, for it differs from machine to machine and from seed to seed.
+    Runs are of one variant where they were asked for equal settings, whatever plan and budgets made of these.
 
     Raises:
         InputError: no run there, one that is not finished, or two with equal settings and one seed.
@@ -47,11 +46,10 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
         wall = WallRecord.read(folder.wall)
         final |= measured({"wall_seconds": wall.wall_seconds if wall else None})
         final["peak_mib"] = history[-1].memory_bytes / 2**20
+        named = re.sub(r"[^A-Za-z0-9_+.-]", "-", path.resolve().name)[:40].lstrip("._-")
         result = CellResult(
             scene=_name_of(place, place[0].name, scenes),
-            variant=_name_of(
-                shared, re.sub(r"[^A-Za-z0-9_+.-]", "-", path.resolve().name)[:40].lstrip("._-"), variants
-            ),
+            variant=_name_of(shared, named, variants),
             seed=config.train.seed,
             settings=settings,
             planned=changes(settings, flat_settings(config.to_mapping())),
@@ -60,10 +58,8 @@ def study_of_runs(paths: Sequence[Path]) -> Study:
         )
         for other_path, other in zip(paths, results, strict=False):
             if other.key == result.key:
-                raise InputError(
-                    f"'{path}' has the settings and the seed of '{other_path}': leave one out, or compare a run with "
-                    "another train.seed"
-                )
+                said = f"'{path}' has the settings and the seed of '{other_path}'"
+                raise InputError(f"{said}: leave one out, or compare a run with another train.seed")
         results.append(result)
     base = next(iter(variants))
     overrides = {

@@ -1,4 +1,4 @@
-"""Numbers over seeds: means with standard errors, differences, time to reach an error, and the Pareto front."""
+"""Numbers over seeds: means with standard errors, differences, and time to reach an error."""
 
 from __future__ import annotations
 
@@ -22,13 +22,7 @@ rounded down."""
 
 @dataclass(frozen=True)
 class Spread:
-    """A quantity over seeds.
-
-    Args:
-        mean: over the seeds; NaN where there is none.
-        standard_error: of the mean; NaN for fewer than two seeds.
-        count: number of seeds.
-    """
+    """Mean over `count` seeds, NaN where there is none, and its standard error, NaN for fewer than two."""
 
     mean: float
     standard_error: float
@@ -53,8 +47,8 @@ class Difference:
     Args:
         mean: the difference; NaN where either has no value.
         standard_error: of the difference; NaN where either has fewer than two seeds.
-        clear: whether noise alone would make as large a difference in fewer than one case of twenty (Welch's t-test);
-            None where either has fewer than `FEWEST_SEEDS` seeds.
+        clear: whether noise alone would seldom make as large a difference (`NOISE`, Welch's t-test); None where either
+            has fewer than `FEWEST_SEEDS` seeds.
     """
 
     mean: float
@@ -102,48 +96,24 @@ def mean_curve(curves: Sequence[Mapping[str, Sequence[float]]], measure: str) ->
     return values.mean(axis=0), errors
 
 
-def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
-    """For each (cost, quality) whether no other point costs as little and is as good, and is better in one of the two.
-
-    A point with NaN is not on the front and keeps no other point from it, as no comparison with NaN is true.
-    """
-
-    def beaten(point: tuple[float, float]) -> bool:
-        return any(other[0] <= point[0] and other[1] >= point[1] and other != point for other in points)
-
-    return [not math.isnan(sum(point)) and not beaten(point) for point in points]
-
-
-@dataclass(eq=False)
+@dataclass(frozen=True)
 class VariantRow:
-    """One variant on one capture, measured over its seeds and compared with the baseline.
-
-    Args:
-        name: of the variant.
-        cells: results of its seeds.
-        base: results of the baseline; none where it has none here.
-        on_front: whether no other variant is at least as fast and has at least the PSNR.
-    """
+    """The seeds of one variant on one capture, `cells`, and the baseline's, `base`, which may have none here."""
 
     name: str
     cells: Sequence[CellResult]
     base: Sequence[CellResult]
-    on_front: bool = False
-
-    def values(self, measure: str) -> list[float]:
-        """A measure of `CellResult.final`, for each seed; NaN where a seed lacks it."""
-        return _values(self.cells, measure)
 
     def spread(self, measure: str) -> Spread:
-        return Spread.of(self.values(measure))
+        return Spread.of(finals(self.cells, measure))
 
     def difference(self, measure: str) -> Difference:
         """Difference from the baseline."""
-        return Difference.of(self.values(measure), _values(self.base, measure))
+        return Difference.of(finals(self.cells, measure), finals(self.base, measure))
 
     def ratio(self, measure: str) -> float:
         """Mean over the baseline's mean; NaN where there is none."""
-        return self.spread(measure).mean / Spread.of(_values(self.base, measure)).mean
+        return self.spread(measure).mean / Spread.of(finals(self.base, measure)).mean
 
     def seconds_to(self, psnr: float) -> list[float]:
         """Seconds in which each seed reached a PSNR in dB; inf where it never did."""
@@ -156,19 +126,15 @@ class VariantRow:
         return own / base if base > 0 and own > 0 else math.nan
 
 
-def _values(cells: Sequence[CellResult], measure: str) -> list[float]:
+def finals(cells: Sequence[CellResult], measure: str) -> list[float]:
+    """A measure of `CellResult.final`, for each seed; NaN where a seed lacks it."""
     return [cell.final.get(measure, math.nan) for cell in cells]
 
 
 @dataclass
 class SceneSummary:
-    """All variants on one capture, in the order of the ablation.
-
-    Args:
-        scene: the capture's name.
-        baseline: name of the variant that the others are compared with, or "" where it has no result here.
-        targets: PSNRs in dB whose time is asked for.
-    """
+    """All variants on one capture, in the order of the ablation; `baseline` is "" where that has no result here.
+    `targets`: PSNRs in dB whose time is asked for."""
 
     scene: str
     baseline: str
@@ -178,17 +144,13 @@ class SceneSummary:
 
 def summarise(study: Study, targets: Sequence[float] = ()) -> list[SceneSummary]:
     """Rows of each capture. `targets`: PSNRs in dB; where empty they follow from the baseline's result."""
-    return [_summarise_scene(study, scene, targets) for scene in study.scenes]
-
-
-def _summarise_scene(study: Study, scene: str, targets: Sequence[float]) -> SceneSummary:
-    cells = {name: results for name in study.ablation.variants if (results := study.of(scene, name))}
-    baseline = study.ablation.baseline if study.ablation.baseline in cells else ""
-    rows = [VariantRow(name, results, cells.get(baseline, [])) for name, results in cells.items()]
-    points = [(row.spread("seconds").mean, row.spread("psnr").mean) for row in rows]
-    for row, on_front in zip(rows, pareto_front(points), strict=True):
-        row.on_front = on_front
-    reached = min(next((row for row in rows if row.name == baseline), rows[0]).values("psnr"))
-    if not targets and math.isfinite(reached):
-        targets = [math.floor(10 * reached) / 10 - step * TARGET_STEP for step in (2, 1, 0)]
-    return SceneSummary(scene, baseline, list(targets), rows)
+    summaries = []
+    for scene in study.scenes:
+        cells = {name: results for name in study.ablation.variants if (results := study.of(scene, name))}
+        baseline = study.ablation.baseline if study.ablation.baseline in cells else ""
+        rows = [VariantRow(name, results, cells.get(baseline, [])) for name, results in cells.items()]
+        reached = min(finals(rows[0].base or rows[0].cells, "psnr"))
+        steps = (2, 1, 0) if math.isfinite(reached) else ()
+        own = [math.floor(10 * reached) / 10 - step * TARGET_STEP for step in steps]
+        summaries.append(SceneSummary(scene, baseline, list(targets) or own, rows))
+    return summaries

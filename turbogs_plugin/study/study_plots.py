@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from PIL import Image
 
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.report.curves import SECONDS_LABEL, STYLE
@@ -26,17 +24,13 @@ SHOWN_BELOW = {"psnr": 4.0, "ssim": 0.06}
 """An axis begins this far below the worst final result: trainings pass what is below in a moment."""
 FAILED_BELOW = 8.0
 """A variant that ends this many dB below the best one has failed: it does not set the axes' scale."""
-PALETTE = 128
-"""Colours of a plot's PNG: a third of the bytes, and no difference that can be seen."""
 
 
 def write_plot(folder: Path, summaries: Sequence[SceneSummary]) -> None:
-    """Draw `PLOT` into a folder, as a PNG of few colours."""
-    drawn = io.BytesIO()
-    with matplotlib.rc_context(dict[Any, Any](STYLE)):  # also while it is saved, where ticks get their labels
-        draw_over_time(summaries).savefig(drawn, format="png")
-    picture = Image.open(drawn).convert("RGB").quantize(PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    write_atomically(folder / PLOT, lambda file: picture.save(file, "PNG", optimize=True))
+    """Draw `PLOT` into a folder."""
+    with matplotlib.rc_context(STYLE):  # also while it is saved, where ticks get their labels
+        figure = draw_over_time(summaries)
+        write_atomically(folder / PLOT, lambda file: figure.savefig(file, format="png"))
 
 
 def _styles(summaries: Sequence[SceneSummary]) -> dict[str, tuple[str, str]]:

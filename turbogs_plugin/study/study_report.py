@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.report.tables import escaped, table
 from turbogs_plugin.study.results import Study, StudyFolder
-from turbogs_plugin.study.statistics import Difference, SceneSummary, Spread, VariantRow, summarise
+from turbogs_plugin.study.statistics import Difference, SceneSummary, Spread, summarise
 from turbogs_plugin.study.study_plots import PLOT, write_plot
 
 MEASURES = {
@@ -35,17 +35,13 @@ HOW_TO_READ = (
     "Seconds of training are the initial error maps and the iterations, on one clock for all cells, without loading, "
     "evaluation and reports. A process first trains a short copy of each variant and throws it away. A number is the "
     "mean over seeds with its standard error. A difference is of two such means; it is clear where noise alone would "
-    "make as large a one in fewer than one case of twenty (Welch's t-test, at least three seeds of each). A star: no "
-    "other variant is at least as fast and has at least the PSNR. Seconds to a PSNR are linear between evaluations."
+    "make as large a one in fewer than one case of twenty (Welch's t-test, at least three seeds of each). "
+    "Seconds to a PSNR are linear between evaluations."
 )
 
 
 def write_report(folder: StudyFolder, targets: Sequence[float] = ()) -> Path:
-    """Write ``results.json`` of everything in the folder, and from it the plot and the page; the page.
-
-    Args:
-        targets: PSNRs in dB whose time is asked for; where empty they follow from the baseline's result.
-    """
+    """Write ``results.json`` of everything in the folder, and from it the plot and the page; the page."""
     folder.write_study(folder.read_study())
     study = folder.read_study()  # with the digits that the file keeps
     summaries = summarise(study, targets)
@@ -75,44 +71,29 @@ def report_text(study: Study, summaries: Sequence[SceneSummary]) -> str:
 
 
 def _machines(study: Study) -> str:
-    rows = [
-        (
-            made.machine,
-            made.kernels,
-            made.commit or "unknown",
-            made.day,
-            ", ".join(map(" ".join, made.software.items())),
-        )
-        if made
-        else ("not recorded: seconds compare only within one machine", "", "", "", "")
-        for made in study.provenances
-    ]
+    rows = []
+    for made in study.provenances:
+        software = made and ", ".join(map(" ".join, made.software.items()))
+        known = made and (made.machine, made.kernels, made.commit or "unknown", made.day, software or "")
+        rows.append(known or ("not recorded: seconds compare only within one machine", "", "", "", ""))
     return table(("machine", "kernels", "commit", "day", "software"), rows)
 
 
 def _results(summary: SceneSummary) -> str:
     """Table of results: a row for each variant, a column for each measure that a cell has."""
     against = f" against {summary.baseline}"
-    columns: dict[str, Callable[[VariantRow], str]] = {
-        "variant": lambda row: row.name,
-        "front": lambda row: "★" if row.on_front else "",
-        "seeds": lambda row: str(len(row.cells)),
-    }
-
-    def add(measure: str, head: str, digits: int) -> None:
-        columns[head] = lambda row: spread_text(row.spread(measure), digits)
-        compared = summary.baseline and len(summary.rows) > 1
-        if compared and measure == "seconds":
-            columns[f"time{against}"] = lambda row: _ratio_text(row.ratio(measure)) if row.base else ""
-        if compared and measure in COMPARED:
-            columns[head + against] = lambda row: (
-                "" if row.name == summary.baseline else difference_text(row.difference(measure), digits)
-            )
-
+    compared = summary.baseline and len(summary.rows) > 1
+    columns = {"variant": [row.name for row in summary.rows], "seeds": [str(len(row.cells)) for row in summary.rows]}
     for measure, (head, digits) in MEASURES.items():
-        if any(measure in cell.final for row in summary.rows for cell in row.cells):
-            add(measure, head, digits)
-    return table(columns, [[cell(row) for cell in columns.values()] for row in summary.rows])
+        if not any(measure in cell.final for row in summary.rows for cell in row.cells):
+            continue
+        columns[head] = [spread_text(row.spread(measure), digits) for row in summary.rows]
+        if compared and measure == "seconds":
+            columns[f"time{against}"] = [_ratio_text(row.ratio(measure)) for row in summary.rows]
+        if compared and measure in COMPARED:
+            others = {row.name: difference_text(row.difference(measure), digits) for row in summary.rows}
+            columns[head + against] = [*(others | {summary.baseline: ""}).values()]
+    return table(columns, zip(*columns.values(), strict=True))
 
 
 def _times(summary: SceneSummary) -> str:
