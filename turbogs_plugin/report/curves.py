@@ -29,14 +29,7 @@ SECONDS_LABEL = "training time in seconds (evaluation excluded)"
 
 
 def plot_against_seconds(path: Path, seconds: Sequence[float], values: Sequence[float], label: str, title: str) -> None:
-    """Draw one measure of a history against seconds of training, as a PNG.
-
-    Args:
-        path: the file.
-        seconds, values: of the evaluations of one run, in order.
-        label: of the vertical axis, with the unit.
-        title: of the plot.
-    """
+    """Draw one measure of a run's evaluations against seconds of training, as a PNG. `label`: of the vertical axis."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 4.0), layout="constrained")
         axes = figure.add_subplot()

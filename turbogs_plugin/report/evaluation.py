@@ -23,13 +23,7 @@ LPIPS_PACKAGES = ("torchvision", "torchmetrics")
 
 
 def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> str:
-    """Errors of a run's newest model, or of a given one, on each test view, as a table.
-
-    Args:
-        path: folder of the run, or the file of a model.
-        device_name: where to render.
-        given: the capture of a model from a file, and how to render it; None: `path` is a run.
-    """
+    """Errors of a run's newest model, or of a given one (see `open_saved`), on each test view, as a table."""
     model, scene = open_saved(path, device_name, given)
     views, look = views_of(model, scene, "test")
     views = place_views(views, model.gaussians.device, model.config.train.pixels_place)
@@ -42,7 +36,11 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
 
 
 def open_saved(path: Path, device_name: str, given: Config | None) -> tuple[SavedModel, Scene]:
-    """A run's newest model or a given one on a device, and its capture on the CPU.
+    """A model on a device, and its capture on the CPU.
+
+    Args:
+        path: folder of a run, whose newest model it is, or the file of a model.
+        given: the capture of a model from a file, and how to render it; None: `path` is a run.
 
     Raises:
         InputError: no such model, or no usable capture.
@@ -65,15 +63,8 @@ def views_of(model: SavedModel, scene: Scene, split: str) -> tuple[PosedImages, 
 
 
 def load_lpips(device: torch.device) -> tuple[ImageError | None, str]:
-    """LPIPS (VGG16) by torchmetrics, if `LPIPS_PACKAGES` are installed and the backbone's weights are in torch's cache.
-    Nothing is downloaded, and what takes seconds to import is imported here.
-
-    Args:
-        device: where to compute.
-
-    Returns:
-        The function, or None; and the reason for None.
-    """
+    """LPIPS (VGG16) by torchmetrics, if `LPIPS_PACKAGES` are installed and the backbone's weights are in torch's cache;
+    or None, and the reason. Nothing is downloaded, and what takes seconds to import is imported here."""
     missing = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         release = torch.__version__.partition("+")[0]  # or pip may bring another torch with torchvision
@@ -81,10 +72,8 @@ def load_lpips(device: torch.device) -> tuple[ImageError | None, str]:
     weights = Path(torch.hub.get_dir()) / "checkpoints" / "vgg16-397923af.pth"  # torchvision's name
     if not weights.is_file():
         # Without the folder's path: studies keep the reason in their records, which others read.
-        return (
-            None,
-            f"there are no weights of VGG16 here: put torchvision's {weights.name} into torch's hub/checkpoints",
-        )
+        remedy = f"put torchvision's {weights.name} into torch's hub/checkpoints"
+        return None, f"there are no weights of VGG16 here: {remedy}"
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to(device)

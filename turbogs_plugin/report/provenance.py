@@ -31,29 +31,20 @@ MODIFIED = "-modified"
 
 @dataclass
 class Provenance:
-    """Where a measurement was made and with what.
+    """Where a measurement was made and with what."""
 
-    Args:
-        machine: in words.
-        software: name -> version.
-        kernels: the CUDA library that ran, or why the torch reference did.
-        commit: of the sources, or "" where unknown.
-        day: ``2026-11-25``, in UTC, when the process began to measure; "" where it was not recorded.
-    """
-
-    machine: str
-    software: dict[str, str]
-    kernels: str
-    commit: str
-    day: str = ""
+    machine: str  # in words
+    software: dict[str, str]  # name -> version
+    kernels: str  # the CUDA library that ran, or why the torch reference did
+    commit: str  # of the sources, or "" where unknown
+    day: str = ""  # 2026-11-25, in UTC, when the process began to measure; "" where it was not recorded
 
 
 def provenance(device_type: str) -> Provenance:
     """The provenance of results of this process, computed on `cpu` or `cuda`."""
     reason = library.unavailable_reason() if device_type == "cuda" else "the device is the CPU"
-    engine = f"{library.library_path().name} for {', '.join(library.architectures())}"
-    if reason:
-        engine = f"none, the torch reference ran: {reason}"
+    built = f"{library.library_path().name} for {', '.join(library.architectures())}"
+    engine = f"none, the torch reference ran: {reason}" if reason else built
     day = datetime.now(timezone.utc).date().isoformat()
     return Provenance(hardware(device_type), dict(software()), engine, source_commit(), day)
 

@@ -13,8 +13,9 @@ from turbogs_plugin.files import read_text, write_text_atomically
 from turbogs_plugin.report.evaluation import load_lpips
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip
 from turbogs_plugin.report.provenance import hardware, software
-from turbogs_plugin.report.tables import ERRORS, error_columns, errors, escaped, history_rows, table, views_table
+from turbogs_plugin.report.tables import ERRORS, error_columns, errors, escaped, table, views_table
 from turbogs_plugin.strategies.view_sampling import doubted
+from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.metrics import Metrics, evaluate, render_view
 from turbogs_plugin.train.session import RunSession
 
@@ -24,11 +25,7 @@ another light. The view sampler `random` takes each in one of five rounds."""
 
 
 def write_report(run: RunSession) -> Path:
-    """Write ``report.md`` and its pictures (in ``report/``) into the run's folder.
-
-    Returns:
-        The page.
-    """
+    """Write ``report.md``, the page that is given back, and its pictures (in ``report/``) into the run's folder."""
     trainer = run.trainer
     look = trainer.look(run.test.names)
     lpips, lpips_reason = load_lpips(trainer.device)
@@ -48,7 +45,12 @@ def write_report(run: RunSession) -> Path:
             image = render_view(trainer.gaussians, views, view_id, seen)
             pixels = strip(views.photos.image(view_id, seen.background), image, views.mask(view_id)).cpu().numpy()
             save_image(pictures / f"{kind}-{view_id:03d}.jpg", pixels)
-    _plot(run, pictures)
+    from turbogs_plugin.report.curves import plot_against_seconds  # loads matplotlib
+
+    seconds = [evaluation.train_seconds for evaluation in run.history]
+    for name, label in (("psnr", "test PSNR in dB"), ("l1", "mean absolute error on test views (0 .. 1)")):
+        values = [getattr(evaluation, name) for evaluation in run.history]
+        plot_against_seconds(pictures / f"{name}.png", seconds, values, label, run.scene.name)
     run.clock.mark("pictures and plots")
     times = {view: view_errors[view] / np.median(view_errors) for view in worst}
     write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, strips, times))
@@ -56,13 +58,8 @@ def write_report(run: RunSession) -> Path:
     return run.folder.report
 
 
-def _plot(run: RunSession, pictures: Path) -> None:
-    from turbogs_plugin.report.curves import plot_against_seconds
-
-    seconds = [evaluation.train_seconds for evaluation in run.history]
-    for name, label in (("psnr", "test PSNR in dB"), ("l1", "mean absolute error on test views (0 .. 1)")):
-        values = [getattr(evaluation, name) for evaluation in run.history]
-        plot_against_seconds(pictures / f"{name}.png", seconds, values, label, run.scene.name)
+def _mebibytes(evaluation: Evaluation) -> str:
+    return f"{evaluation.memory_bytes / 2**20:.0f}"
 
 
 def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int, doubts: dict[int, float]) -> str:
@@ -97,9 +94,11 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int, doub
     heads = (*columns.values(), "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB")
     wall = run.wall.wall_seconds
     seconds = f"{last.train_seconds:.1f}", "not recorded" if wall is None else f"{wall:.1f}"
-    rows = history_rows(run.history)
-    *_, memory = rows[-1]
-    cells = (*errors(metrics.mean, columns), *seconds, str(last.num_gaussians), f"{metrics.fps:.1f}", memory)
+    rows = [
+        (str(of.iteration), f"{of.train_seconds:.1f}", *errors(of), str(of.num_gaussians), _mebibytes(of))
+        for of in run.history
+    ]
+    cells = (*errors(metrics.mean, columns), *seconds, str(last.num_gaussians), f"{metrics.fps:.1f}", _mebibytes(last))
     result = table(heads, [cells])
     lpips = f"\nLPIPS was not computed: {lpips_reason}.\n" if lpips_reason else ""
     history = table(("iteration", "training in s", *ERRORS.values(), "Gaussians", "peak memory in MiB"), rows)

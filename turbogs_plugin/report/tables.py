@@ -12,13 +12,8 @@ from turbogs_plugin.train.metrics import Metrics, ViewMetrics
 ERRORS = {"psnr": "PSNR in dB", "ssim": "SSIM", "l1": "mean absolute error"}
 """Measure -> head of its column, in every table of errors. Masked pixels do not count in them."""
 
-FURTHER_KINDS = {
-    "own": "of the model's own colours",
-    "refined": "by refined test cameras",
-}
-
-FURTHER = {f"{kind}_{name}": f"{head} {said}" for kind, said in FURTHER_KINDS.items() for name, head in ERRORS.items()}
-"""Measure of `FurtherErrors` -> head of its column."""
+FURTHER = {"own": "of the model's own colours", "refined": "by refined test cameras"}
+"""Kind of `FurtherErrors` -> what the head of its column adds."""
 
 
 def escaped(text: object) -> str:
@@ -46,8 +41,9 @@ def errors(measured: ViewMetrics | Evaluation, columns: Iterable[str] = ERRORS, 
 def error_columns(metrics: Metrics) -> dict[str, str]:
     """Measure -> head of its column, for all measures of a model's test views: `ERRORS`, LPIPS, and the kinds
     of `FurtherErrors` that were computed."""
-    computed = {name for name, value in metrics.mean.further().items() if name.endswith("l1") and not math.isnan(value)}
-    further = {name: head for name, head in FURTHER.items() if f"{name.partition('_')[0]}_l1" in computed}
+    mean = metrics.mean.further()
+    computed = {kind: said for kind, said in FURTHER.items() if not math.isnan(mean[f"{kind}_l1"])}
+    further = {f"{kind}_{name}": f"{ERRORS[name]} {said}" for kind, said in computed.items() for name in ERRORS}
     return ERRORS | {"lpips": "LPIPS (VGG)"} | further
 
 
@@ -58,15 +54,6 @@ def views_table(metrics: Metrics, with_means: bool = False) -> str:
     if with_means:
         rows.append([metrics.mean.name, *errors(metrics.mean, columns, psnr_digits=4)])
     return table(["view", *columns.values()], rows)
-
-
-def history_rows(history: Iterable[Evaluation]) -> list[list[str]]:
-    """Rows of a history, one an evaluation: iteration, seconds of training, `ERRORS`, Gaussians, MiB of memory."""
-    rows = []
-    for entry in history:
-        cells = [str(entry.iteration), f"{entry.train_seconds:.1f}", *errors(entry), str(entry.num_gaussians)]
-        rows.append([*cells, f"{entry.memory_bytes / 2**20:.0f}"])
-    return rows
 
 
 def history_table(history: list[Evaluation]) -> str:

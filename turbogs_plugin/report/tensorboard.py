@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +17,6 @@ from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.sections import STRIPS
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.images import strip
-from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.metrics import render_view
@@ -44,47 +42,31 @@ def event_writers(config: Config) -> list[Callable[[RunSession], Listener]]:
     if not config.report.tensorboard:
         return []
     _writer_class()
-    return [EventWriter.of_run]
+    return [EventWriter]
 
 
 class EventWriter(Listener):
-    """Writes event files for TensorBoard at each evaluation.
+    """Writes event files for TensorBoard at each evaluation of a run, new or resumed."""
 
-    Args:
-        folder: of the files; made with the first of them.
-        test: the test views, on any device.
-        strips: views shown as pictures, at most.
-        first: points of earlier files from this iteration on are void.
-    """
-
-    def __init__(self, folder: Path, test: PosedImages, strips: int, first: int = 0) -> None:
-        self.folder, self._test, self._shown, self._first = folder, test, min(strips, len(test)), first
+    def __init__(self, session: RunSession) -> None:
+        self._folder, self._test = session.folder.tensorboard, session.test
+        # The history of a resumed run ends at its checkpoint: later points of earlier files are void.
+        self._first = session.trainer.iteration + 1 if session.resumed else 0
         self._writer: SummaryWriter | None = None
-
-    @classmethod
-    def of_run(cls, session: RunSession) -> EventWriter:
-        """The writer of a run, new or resumed: a resumed run's history ends at its checkpoint."""
-        first = session.trainer.iteration + 1 if session.resumed else 0
-        return cls(session.folder.tensorboard, session.test, STRIPS, first)
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         iteration = evaluation.iteration
         if self._writer is None:
-            self._writer = _writer_class()(str(self.folder), purge_step=self._first)
+            self._writer = _writer_class()(str(self._folder), purge_step=self._first)
         for name, value in asdict(evaluation).items():
             if name != "iteration" and not math.isnan(value):
                 self._writer.add_scalar(f"{GROUPS.get(name, 'test')}/{name}", value, iteration)
-        for view in range(self._shown):
+        for view in range(min(STRIPS, len(self._test))):
             pixels = self._strip(loop, view)
             self._writer.add_image(f"test views/{self._test.names[view]}", pixels, iteration, dataformats="HWC")
         self._writer.flush()
         if loop.finished:
-            self.close()
-
-    def close(self) -> None:
-        """End the files, and the thread that writes them."""
-        if self._writer is not None:
-            self._writer.close()
+            self._writer.close()  # and its thread
             self._writer = None
 
     def _strip(self, loop: TrainingLoop, view: int) -> np.ndarray:
