@@ -34,14 +34,8 @@ def time_engine(
     overrides: Sequence[str],
     device: torch.device,
 ) -> dict[str, Any]:
-    """What ``step`` or ``raster`` measures.
-
-    Args:
-        scene: folder of the capture.
-        ply: model of the capture, which is resized, so that several builds time the same one.
-        sizes: numbers of Gaussians of the models to time.
-        views: numbers of views of an iteration or pass.
-    """
+    """What ``step`` or ``raster`` measures on a capture, with its model resized to these numbers of Gaussians, for each
+    of these numbers of views."""
     capture = load_scene(scene, load_config("turbogs", overrides).scene.factor)
     capture = replace(capture, train=capture.train.to(device))
     loaded = load_given(ply, capture).map(lambda value: value.to(device))
@@ -52,15 +46,12 @@ def time_engine(
 
 
 def require_result_file(out: Path | None) -> None:
-    """Check the place of the result before anything is measured. An older result of the same name is replaced.
-
-    Raises:
-        InputError: it is a folder, or no file can be made there.
-    """
-    if out is not None and (out.is_dir() or not out.absolute().parent.is_dir()):
+    """Raise `InputError` before anything is measured, where no file of the result can be made or replaced."""
+    if out is None:
+        return
+    if out.is_dir() or not out.absolute().parent.is_dir():
         raise InputError(f"--out '{out}': name a file in a folder that exists")
-    if out is not None:
-        require_writable(out.parent, f"--out '{out}'")
+    require_writable(out.parent, f"--out '{out}'")
 
 
 def write(what: str, measured: dict[str, Any], device: torch.device, out: Path | None) -> None:

@@ -35,19 +35,11 @@ RATES = (1.0, 0.1)
 
 
 def bench_raster(scene: Scene, models: Iterable[Gaussians], views: Sequence[int], repeats: int) -> dict[str, Any]:
-    """Time the rasterizer's passes, and gsplat's dense ones over the fewest views.
-
-    Args:
-        scene: capture, for its cameras.
-        views: numbers of views K, each with the rate of the pixel budget.
-        repeats: timed calls of each pass.
-
-    Returns:
-        Numbers ready for JSON; ``passes`` has an entry for each model, K and rate.
-    """
+    """Time the rasterizer's passes, for each model and K with the rate of the pixel budget, and gsplat's dense ones of the
+    fewest views: numbers ready for JSON."""
     fewest, passes, dense = min(views), [], []
     settings = [(count, PIXEL_BUDGET / count, False) for count in views] + [(fewest, rate, False) for rate in RATES]
-    settings.append((*settings[0][:2], True))
+    settings.append((views[0], PIXEL_BUDGET / views[0], True))
     for model in models:
         cameras = scene.train.cameras.to(model.device, torch.float32)
         bandwidth = copy_bandwidth(model.device)
@@ -68,11 +60,8 @@ def bench_raster(scene: Scene, models: Iterable[Gaussians], views: Sequence[int]
 def time_passes(
     model: Gaussians, cameras: Cameras, rate: float, density: bool, repeats: int, bandwidth: float
 ) -> dict[str, Any]:
-    """One (model, views, rate): times of the stages and of forward and backward pass, counts and floors.
-
-    Args:
-        density: with the sums that density control needs.
-    """
+    """Times of the stages and of forward and backward pass, counts and floors. `density`: with the sums that density
+    control needs."""
     device = model.device
     samples = tile_samples(cameras.sizes, rate, device, seed=1)
     engine = engine_of(device, for_training=True)

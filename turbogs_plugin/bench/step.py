@@ -35,13 +35,10 @@ from turbogs_plugin.types import Gaussians
 
 NO_EVENTS = 1 << 20
 """Iteration of the first density event, which is never reached. Statistics are kept as in any training."""
-
 FIRST_EVENT = {"refine_from", "refine_start_iter"}
 """Setting of the first density event, by its name in each kind of density control."""
-
 RATE_FACTOR = 1e-3
 """Factor of the learning rates. Small steps take as long as large ones, and the timed model hardly changes."""
-
 WARMUP_ITERATIONS = {"cuda": 40, "cpu": 2}
 """On a GPU more than the workspace's early passes, so that its buffers have their steady size."""
 
@@ -49,15 +46,11 @@ WARMUP_ITERATIONS = {"cuda": 40, "cpu": 2}
 def bench_step(
     scene: Scene, models: Iterable[Gaussians], views: Sequence[int], repeats: int, overrides: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Time iterations of training, for each model with each number of views K.
+    """Time iterations of training, for each model with each number of views K. Returns numbers ready for JSON.
 
     Args:
         scene: capture with its photos on the models' device, or every trainer copies them.
-        repeats: timed iterations.
         overrides: changes of the configuration that is timed.
-
-    Returns:
-        Numbers ready for JSON; ``passes`` has an entry for each model and K.
     """
     passes = []
     for model in models:
@@ -97,14 +90,8 @@ def timed_config(overrides: Sequence[str], views: int) -> Config:
 
 
 def time_iterations(trainer: Trainer, repeats: int, bandwidth: float) -> dict[str, Any]:
-    """Times of a warm trainer's iterations and their steps, counts of an iteration, and floors.
-
-    Args:
-        bandwidth: bytes a second, for the floors.
-
-    Returns:
-        Numbers ready for JSON. ``peak``: bytes allocated at most, which the trainer's owner has to part; 0 on a CPU.
-    """
+    """Times of a warm trainer's iterations and their steps, counts of an iteration, and floors, ready for JSON.
+    ``peak``: bytes allocated at most, which the trainer's owner has to part; 0 on a CPU."""
     device, on_gpu = trainer.device, trainer.device.type == "cuda"
     if on_gpu:
         torch.cuda.empty_cache()
@@ -150,10 +137,8 @@ def time_iterations(trainer: Trainer, repeats: int, bandwidth: float) -> dict[st
 
 
 def density_event(trainer: Trainer, overrides: Sequence[str]) -> dict[str, Any] | None:
-    """One event of density control with its change of model and optimizer state, by the statistics of this trainer.
-
-    None where the density control has no such events.
-    """
+    """One event of density control with its change of model and optimizer state, by the statistics of this trainer;
+    None where the density control has no such events."""
     usual = load_config("turbogs", overrides).without_plan()
     if "refine_from" not in usual.density:
         return None
@@ -180,13 +165,8 @@ def density_event(trainer: Trainer, overrides: Sequence[str]) -> dict[str, Any] 
 
 
 def memory(trainer: Trainer, scene: Scene, peak: int, held: int) -> dict[str, int | None]:
-    """Bytes of what is stored, and the peak of the timed iterations.
-
-    Args:
-        scene: capture whose photos the trainer shares where they were on the device already.
-        peak: bytes allocated at most.
-        held: bytes allocated before the trainer was made: the scene's photos, the bench's own copy of the model.
-    """
+    """Bytes of what is stored, and the peak of the timed iterations. `held`: bytes allocated before the trainer was made,
+    of the scene's photos, which it shares where they were on the device already, and the bench's copy of the model."""
     stored = {
         "parameters": tensor_bytes(dict(trainer.gaussians.items())),
         "optimizer": tensor_bytes(trainer.optimizer.state_dict()),

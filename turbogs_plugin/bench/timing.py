@@ -64,7 +64,7 @@ Span = tuple[Mark, Mark]
 
 
 def device_times(spans: Iterable[Span]) -> Summary:
-    """Summary of spans on the device. A GPU must have been waited for."""
+    """Spans on the device. A GPU must have been waited for."""
     return summary([first.until(last) for first, last in spans])
 
 
@@ -110,12 +110,7 @@ def copy_bandwidth(device: torch.device) -> float:
 
 
 class Recorder:
-    """Spans of function calls.
-
-    Attributes:
-        spans: name -> spans in the order of the calls.
-        rendered, samples: results of the latest forward pass of a trainer that is `recorded`.
-    """
+    """Spans of function calls, by name and in their order; and the latest forward pass of a trainer that is `recorded`."""
 
     rendered: Rendered
     samples: PixelSamples

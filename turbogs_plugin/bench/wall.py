@@ -13,31 +13,20 @@ from typing import Any
 
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.train.clock import WallRecord
-from turbogs_plugin.train.inputs import DEVICE
 from turbogs_plugin.train.run_files import RunFolder
 
 REST = "start of the process, and its end"
 """What a process cannot measure of itself."""
 
-BEFORE_TRAINING = (DEVICE, "plan", "initial model", "initial maps", "first evaluation")
-"""Parts between the photos and the first iteration."""
-
 
 @dataclass
 class WallRun:
-    """One run of the command.
+    """One run of the command."""
 
-    Args:
-        seconds: from its start to its end, seen from outside.
-        train_seconds: training, as the run's history has it.
-        model_seconds: from the start of its command until the model was written.
-        parts: what -> seconds that went into it; together they are `seconds`.
-    """
-
-    seconds: float
-    train_seconds: float
-    model_seconds: float
-    parts: dict[str, float]
+    seconds: float  # from its start to its end, seen from outside
+    train_seconds: float  # training, as the run's history has it
+    model_seconds: float  # from the start of its command until the model was written
+    parts: dict[str, float]  # what -> seconds that went into it; together they are `seconds`
 
     @property
     def ready_seconds(self) -> float:
@@ -48,11 +37,6 @@ class WallRun:
     def beside_training(self) -> float:
         """Seconds of `ready_seconds` that are not training."""
         return self.ready_seconds - self.train_seconds
-
-    @property
-    def to_first_iteration(self) -> float:
-        """Seconds from decoded photos to the first iteration."""
-        return sum(self.parts.get(part, 0.0) for part in BEFORE_TRAINING)
 
 
 def time_command(arguments: Sequence[str]) -> WallRun:
@@ -83,7 +67,7 @@ def bench_wall(arguments: Sequence[str], repeats: int) -> dict[str, Any]:
         arguments: of `turbogs train`, the capture's folder first; the record has the folder's name alone.
 
     Returns:
-        ``runs``, in their order, and ``median``, the one in the middle by its seconds; the lower one of two.
+        ``runs``, and ``median``, the one in the middle by its seconds; the lower one of two.
     """
     runs = [time_command(arguments) for _ in range(repeats)]
     middle = sorted(runs, key=lambda run: run.seconds)[(len(runs) - 1) // 2]
@@ -99,7 +83,6 @@ def wall_lines(measured: dict[str, Any]) -> list[str]:
         "training alone": middle.train_seconds,
         "until model, report and pictures are there": middle.ready_seconds,
         "beside training, until then": middle.beside_training,
-        "from photos to the first iteration": middle.to_first_iteration,
     }
     width = max(map(len, (*middle.parts, *sums)))
     parts, totals = (

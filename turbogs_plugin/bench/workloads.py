@@ -36,10 +36,8 @@ def train(trainer: Trainer, iterations: int) -> None:
 
 
 def resized(gaussians: Gaussians, count: int, seed: int = 0) -> Gaussians:
-    """A model that looks the same, with `count` Gaussians: a random subset, or all and jittered copies of random ones.
-
-    Standard deviations change with the inverse root of the number, so that surfaces stay covered as they were. Copies
-    follow their original in memory.
+    """A model that looks the same, with `count` Gaussians: a random subset, or all and jittered copies of random ones,
+    which follow their original in memory. Surfaces stay covered, as standard deviations change with the number's root.
     """
     present = len(gaussians)
     generator = torch.Generator().manual_seed(seed)
