@@ -35,8 +35,8 @@ RATES = (1.0, 0.1)
 
 
 def bench_raster(scene: Scene, models: Iterable[Gaussians], views: Sequence[int], repeats: int) -> dict[str, Any]:
-    """Time the rasterizer's passes, for each model and K with the rate of the pixel budget, and gsplat's dense ones of the
-    fewest views: numbers ready for JSON."""
+    """Time the rasterizer's passes, for each model and K with the rate of the pixel budget, and gsplat's dense ones of
+    the fewest views: numbers ready for JSON."""
     fewest, passes, dense = min(views), [], []
     settings = [(count, PIXEL_BUDGET / count, False) for count in views] + [(fewest, rate, False) for rate in RATES]
     settings.append((views[0], PIXEL_BUDGET / views[0], True))

@@ -165,8 +165,9 @@ def density_event(trainer: Trainer, overrides: Sequence[str]) -> dict[str, Any] 
 
 
 def memory(trainer: Trainer, scene: Scene, peak: int, held: int) -> dict[str, int | None]:
-    """Bytes of what is stored, and the peak of the timed iterations. `held`: bytes allocated before the trainer was made,
-    of the scene's photos, which it shares where they were on the device already, and the bench's copy of the model."""
+    """Bytes of what is stored, and the peak of the timed iterations. `held`: bytes allocated before the trainer was
+    made: the scene's photos, which it shares where they were on the device already, and the bench's copy of the model.
+    """
     stored = {
         "parameters": tensor_bytes(dict(trainer.gaussians.items())),
         "optimizer": tensor_bytes(trainer.optimizer.state_dict()),

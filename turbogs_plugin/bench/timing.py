@@ -110,7 +110,7 @@ def copy_bandwidth(device: torch.device) -> float:
 
 
 class Recorder:
-    """Spans of function calls, by name and in their order; and the latest forward pass of a trainer that is `recorded`."""
+    """Spans of function calls, by name; and the latest forward pass of a trainer that is `recorded`."""
 
     rendered: Rendered
     samples: PixelSamples
