@@ -30,8 +30,8 @@ STEEPNESS = 3.0
 
 
 @dataclass
-class _AdaptiveSchedule:
-    """The appendix's equations; subclasses give `phi`.
+class SinusoidalSchedule:
+    """The appendix's equations, with its phi(ratio) = sin(pi/2 * sqrt(ratio)), most sensitive where the error is low.
 
     Args:
         min_views: K_min, fewest views of an iteration; 3 in the paper.
@@ -54,7 +54,7 @@ class _AdaptiveSchedule:
 
     def phi(self, ratio: float) -> float:
         """The modulation of the error ratio, from [0, 1] onto [0, 1]."""
-        raise NotImplementedError
+        return math.sin(0.5 * math.pi * math.sqrt(ratio))
 
     def query(self, step: Step, mean_error: float, initial_error: float, num_views: int) -> SamplingBudget:
         """The budget of this iteration.
@@ -73,15 +73,7 @@ class _AdaptiveSchedule:
 
 
 @dataclass
-class SinusoidalSchedule(_AdaptiveSchedule):
-    """phi(ratio) = sin(pi/2 * sqrt(ratio)): the paper's, most sensitive where the error is low."""
-
-    def phi(self, ratio: float) -> float:
-        return math.sin(0.5 * math.pi * math.sqrt(ratio))
-
-
-@dataclass
-class LinearSchedule(_AdaptiveSchedule):
+class LinearSchedule(SinusoidalSchedule):
     """phi(ratio) = ratio."""
 
     def phi(self, ratio: float) -> float:
@@ -89,7 +81,7 @@ class LinearSchedule(_AdaptiveSchedule):
 
 
 @dataclass
-class ExponentialSchedule(_AdaptiveSchedule):
+class ExponentialSchedule(SinusoidalSchedule):
     """phi(ratio) = (1 - exp(-3 ratio)) / (1 - exp(-3)).
 
     The paper names an exponential variant but gives no equation. The one here saturates and passes (0, 0) and (1, 1).

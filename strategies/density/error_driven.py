@@ -46,7 +46,7 @@ class ErrorDrivenDensity(WindowedDensity):
     Args:
         lambda_base: weight of the distance term in the score; 0.8 in the paper.
         score: difficulty as in the equation (`raw`), or with e and d each divided by its mean over the seen Gaussians
-            (`balanced`), so that both count: d is of order 1 and e of order 0.1.
+            (`balanced`), so that both count: d is about 1, e about 0.1.
         refine_from: first iteration of densification, tau_from; 200 in the paper.
         refine_every: interval of densification, Delta_dens; 100 .. 350 in the paper.
         grad_threshold: least screen gradient of what is densified, a mean over views in gsplat's units, tau_grad;
@@ -120,6 +120,7 @@ class ErrorDrivenDensity(WindowedDensity):
         require_each(self, lambda value: 0 <= value < 1, "at least 0 and less than 1", *shares)
         require_settings(self)
 
+    @torch.no_grad()
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         if self.stats is None or len(gaussians) == 0:
             return None
@@ -127,12 +128,11 @@ class ErrorDrivenDensity(WindowedDensity):
         over = self.max_gaussians > 0 and len(gaussians) > self.bound(step)
         reduce = over and self._reduction_due(step)
         update = None
+        if densify:
+            update = self._refine(gaussians, step)
+        elif final or reduce:
+            update = self._prune(gaussians, step, 1 - self.final_keep if final else 0.0)
         if densify or final or reduce:
-            with torch.no_grad():
-                if densify:
-                    update = self._refine(gaussians, step)
-                else:
-                    update = self._prune(gaussians, step, 1 - self.final_keep if final else 0.0)
             self.stats.zero_()
         if step.iteration >= self._last_event(step) and (reduce or not over):
             self.stats = None
@@ -174,11 +174,8 @@ class ErrorDrivenDensity(WindowedDensity):
         return after and self.max_gaussians > 0 and self.stats is not None
 
     def _last_event(self, step: Step) -> int:
-        """Iteration after which no statistics are needed: the last event's, or the end of densification.
-
-        Not the iteration of the last densification: a time budget may still move `refine_until` and make room for
-        another one.
-        """
+        """Iteration after which no statistics are needed: the last event's, or the end of densification, not its last
+        event: a time budget may still move `refine_until` and make room for another one."""
         return step.refine_until + self._final_prunings(step) * self.final_every
 
     def _final_prunings(self, step: Step) -> int:
@@ -199,10 +196,9 @@ class ErrorDrivenDensity(WindowedDensity):
         return (weights > 0) & torch.isfinite(weights + stats.error_sums + stats.distance_sums)
 
     def _refine(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
-        extent = step.scene_extent
         worth, known, seen = self._worth(step)
         finite = finite_rows(gaussians)
-        spared = self._spared(gaussians, finite, extent)
+        spared = self._spared(gaussians, finite, step)
         sound = finite & (torch.sigmoid(gaussians.opacities) >= self.prune_opacity)
         if self.prune_score_fraction > 0:
             sound &= ~_lowest(worth, known & seen & ~spared, self.prune_score_fraction)
@@ -212,7 +208,7 @@ class ErrorDrivenDensity(WindowedDensity):
         if self.choose_by == "squares":
             candidates = _first(order, seen & sound, candidates.sum())
         largest = gaussians.scales.amax(dim=-1).exp()  # [N]
-        large = largest > self.percent_dense * extent
+        large = largest > self.percent_dense * step.scene_extent
         fitting = ~self._oversized(gaussians, largest, step)
         kept, count = keep_one(spared | (sound & (fitting | (candidates & large))), gaussians)
         candidates &= kept
@@ -234,19 +230,16 @@ class ErrorDrivenDensity(WindowedDensity):
         return passes & seen & (worth >= _quantile(worth, seen, 1 - self.top_fraction))
 
     def _oversized(self, gaussians: Gaussians, largest: Tensor, step: Step) -> Tensor:
-        """[N] bool, which are too large by the size rules, if those have begun.
-
-        Args:
-            largest: [N], the largest standard deviation of each.
-        """
-        begun, limit = step.progress >= self.prune_size_from, math.inf
-        if begun and self.prune_world_size > 0:
+        """[N] bool, which are too large by the size rules, if those have begun; `largest`: standard deviations [N]."""
+        oversized = torch.zeros_like(largest, dtype=torch.bool)
+        if step.progress < self.prune_size_from:
+            return oversized
+        if self.prune_world_size > 0:
             reference = step.scene_extent
             if self.prune_world_reference == "distance":
                 reference = gaussians.means.norm(dim=-1).clamp(min=reference)
-            limit = self.prune_world_size * reference
-        oversized = largest > limit
-        if begun and self.prune_screen_size > 0:
+            oversized = largest > self.prune_world_size * reference
+        if self.prune_screen_size > 0:
             oversized |= self.window.max_radii > self.prune_screen_size
         return oversized
 
@@ -261,17 +254,16 @@ class ErrorDrivenDensity(WindowedDensity):
         score, seen = self.scores(step)
         return score, seen, seen
 
-    def _spared(self, gaussians: Gaussians, finite: Tensor, extent: float) -> Tensor:
+    def _spared(self, gaussians: Gaussians, finite: Tensor, step: Step) -> Tensor:
         """[N] bool: the finite ones that lie beyond `spare_beyond`."""
-        if self.spare_beyond == 0:
-            return torch.zeros_like(finite)
-        return finite & (gaussians.means.norm(dim=-1) > self.spare_beyond * extent)
+        beyond = self.spare_beyond * step.scene_extent if self.spare_beyond > 0 else math.inf
+        return finite & (gaussians.means.norm(dim=-1) > beyond)
 
     def _prune(self, gaussians: Gaussians, step: Step, share: float) -> RowUpdate | None:
         """Remove the `share` of least worth, and what is beyond the bound."""
         finite = finite_rows(gaussians)
         worth, known, seen = self._worth(step)
-        spared = self._spared(gaussians, finite, step.scene_extent)
+        spared = self._spared(gaussians, finite, step)
         kept = finite & ~_lowest(worth, known & seen & ~spared, share)
         kept, count = keep_one(kept, gaussians)
         return removal(~self._within_bound(kept, count, worth, known, spared, step))

@@ -27,14 +27,11 @@ class _FilledStrategy(DefaultStrategy):
 class GsplatDefaultDensity(WindowedDensity):
     """gsplat's own clone, split, prune and reset, run on our parameters and statistics.
 
-    gsplat changes parameters and optimizer state together. Here gsplat gets the parameters, optimizers whose only state
-    marks the rows that gsplat makes or resets, and the row numbers as one more running statistic. The result is a
-    `RowUpdate`. Events end at `Step.refine_until` (gsplat's `refine_stop_iter`).
-
-    An event first removes Gaussians that are not finite or too large to be split, on which gsplat would fail or go on
-    training with NaN. One Gaussian, the most opaque, is always left.
-
-    All other settings are gsplat's own defaults.
+    gsplat gets the parameters, optimizers whose only state marks the rows that it makes or resets, and the row numbers
+    as one more running statistic; a `RowUpdate` says what it did. Events end at `Step.refine_until` (gsplat's
+    `refine_stop_iter`). An event first removes Gaussians that are not finite or too large to be split, on which gsplat
+    would fail or go on training with NaN. One Gaussian, the most opaque, is always left. All other settings are
+    gsplat's own defaults.
 
     Args:
         refine_start_iter: iteration after which densification begins.
@@ -74,7 +71,6 @@ class GsplatDefaultDensity(WindowedDensity):
         values = {name: value[usable] for name, value in gaussians.items()}
         sums = {"grad2d": self.stats.grad_sums, "count": self.stats.view_counts, "radii": self.stats.max_radii}
         state: dict[str, Any] = {name: rows[usable] for name, rows in sums.items()}
-        # gsplat treats the row numbers as one more running statistic.
         state |= {"source_row": usable, "scene_scale": step.scene_extent}
         params, optimizers = run_gsplat(strategy, values, state, step)
         if reset_due and self.opacity_reset == "repaired":

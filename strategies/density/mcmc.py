@@ -28,15 +28,12 @@ class GsplatMcmcDensity(DensityController):
     """gsplat's relocation, growth and noise (Kheradmand et al. 2024), run on our parameters.
 
     The noise on the means, which is part of every iteration, is added in place. The method's dead Gaussians come from
-    terms of opacity and scale in the objective (0.01 each in gsplat's trainer). Here the terms are `DenseAdam`'s
-    `opacity_reg` and `scale_reg`, which ``configs/mcmc.yaml`` sets. Relocation and growth stop at `Step.refine_until`
-    (gsplat's `refine_stop_iter`).
+    terms of opacity and scale in the objective: `DenseAdam`'s `opacity_reg` and `scale_reg`, which
+    ``configs/mcmc.yaml`` sets. Relocation and growth stop at `Step.refine_until` (gsplat's `refine_stop_iter`).
 
     Three rules avoid cases in which gsplat would fail or go on training with NaN. A Gaussian that is not finite, or too
     large, counts as dead. Noise that is not finite is left out. An event without living Gaussians relocates and adds
-    none.
-
-    All other settings are gsplat's own defaults.
+    none. All other settings are gsplat's own defaults.
 
     Args:
         max_gaussians: most Gaussians, `cap_max` of `gsplat.MCMCStrategy`.

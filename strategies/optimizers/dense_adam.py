@@ -25,21 +25,17 @@ OPTIONS |= {"weight_decay": 0.0, "amsgrad": False, "maximize": False}
 class DenseAdam:
     """Adam (Kingma & Ba 2015) by torch's own fused kernels, on all N Gaussians.
 
-    Differences from `SparseAdam`:
-
-    - a Gaussian that no sample touched has a gradient of zero: its moments decay, and its momentum still moves it;
-    - the bias correction counts iterations of the run, not updates of the Gaussian and those it was made of.
-
-    Two things differ from `torch.optim.Adam`. An iteration whose samples touched nothing changes nothing; on the GPU,
-    iterations that will be repeated are of this kind too. A Gaussian with a non-finite gradient is treated as
-    untouched, and counted.
+    A Gaussian that no sample touched has a gradient of zero: unlike in `SparseAdam`, its moments decay, and its
+    momentum still moves it. The bias correction counts iterations of the run. Unlike in `torch.optim.Adam`, an
+    iteration whose samples touched nothing changes nothing (on the GPU, iterations that will be repeated are of this
+    kind), and a Gaussian with a non-finite gradient is treated as untouched, and counted.
 
     Args:
         learning_rates: rate of each parameter over the run.
         opacity_reg: weight of the mean opacity, after the sigmoid, in the objective.
-        scale_reg: weight of the mean standard deviation, world units, in the objective. Both are terms of the loss of
-            3DGS-MCMC (Kheradmand et al. 2024; 0.01 each in gsplat's trainer). A `SparseLoss` sees only colours, so the
-            gradients of these two terms are added here, before the moments.
+        scale_reg: weight of the mean standard deviation, world units, in the objective. Both are terms of 3DGS-MCMC's
+            loss (Kheradmand et al. 2024; 0.01 each in gsplat's trainer). A `SparseLoss` sees only colours, so their
+            gradients are added here, before the moments.
     """
 
     learning_rates: LearningRates = field(default_factory=LearningRates)
