@@ -26,6 +26,12 @@ def clone(gaussians: Gaussians) -> Gaussians:
     return gaussians.map(lambda value: value.clone())
 
 
+def ready(optimizer, gaussians: Gaussians):
+    """The optimizer, set up for these Gaussians."""
+    optimizer.setup(gaussians)
+    return optimizer
+
+
 def make_gradients(views: int, count: int, seed: int = 1, dtype=torch.float64, size: float = 1e-5) -> GaussianGradients:
     """Random gradients of about `size` in every view, all Gaussians touched, loss shares of about `size`."""
     generator = torch.Generator().manual_seed(seed)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from gsplat.strategy.ops import duplicate, remove, reset_opa
-from helpers.optimizers import STEP, equal, make_gaussians, make_gradients
+from helpers.optimizers import STEP, equal, make_gaussians, make_gradients, ready
 
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam
@@ -60,8 +60,7 @@ def leave_untouched(gradients, seed: int):
 
 def test_equals_torch_adam_through_gsplats_surgery():
     gaussians = make_gaussians(9)
-    reference, optimizer = Reference(gaussians), DenseAdam(RATES)
-    optimizer.setup(gaussians)
+    reference, optimizer = Reference(gaussians), ready(DenseAdam(RATES), gaussians)
     for seed in range(24):
         gradients = leave_untouched(make_gradients(3, len(gaussians), seed), seed)
         optimizer.step(gaussians, gradients, STEP)
@@ -90,8 +89,8 @@ def test_equals_torch_adam_through_gsplats_surgery():
 def test_regularizers_are_those_of_gsplats_loss():
     """gsplat's trainer adds the means of opacities and scales to its loss; autograd says what follows."""
     gaussians = make_gaussians(9)
-    reference, optimizer = Reference(gaussians), DenseAdam(RATES, opacity_reg=0.02, scale_reg=0.03)
-    optimizer.setup(gaussians)
+    reference = Reference(gaussians)
+    optimizer = ready(DenseAdam(RATES, opacity_reg=0.02, scale_reg=0.03), gaussians)
 
     def regularizer(params):
         return 0.02 * torch.sigmoid(params["opacities"]).abs().mean() + 0.03 * torch.exp(params["scales"]).abs().mean()
@@ -107,9 +106,8 @@ def test_regularizers_are_those_of_gsplats_loss():
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_non_finite_gradient_counts_as_untouched(name, bad):
     clean, dirty = make_gaussians(5), make_gaussians(5)
-    optimizers = [DenseAdam(RATES), DenseAdam(RATES)]
+    optimizers = [ready(DenseAdam(RATES), gaussians) for gaussians in (clean, dirty)]
     for index, gaussians in enumerate((clean, dirty)):
-        optimizers[index].setup(gaussians)
         optimizers[index].step(gaussians, make_gradients(3, 5), STEP)
         gradients = make_gradients(3, 5, seed=2)
         if index == 0:

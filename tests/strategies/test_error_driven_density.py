@@ -134,31 +134,35 @@ def test_event_equals_plain_loops(seed, config):
     assert len(splits) + len(prunes) > 0
 
 
-def test_events_are_when_the_table_says():
-    gaussians = make_gaussians(30)
-    density = ErrorDrivenDensity(refine_every=50, final_every=100, opacity_decay=0.01, final_keep=0.9)
-    density.setup(gaussians)
-    events, counted = [], []
-    for iteration in range(900):
+def follow(density, gaussians, steps, seen=1.0):
+    """(step, change, the model after it) of each step, with random statistics in each window."""
+    for step in steps:
         if density.stats is not None:
-            counted.append(iteration)
-            density.stats.weight_sums += 1
-            density.stats.error_sums += torch.arange(len(gaussians)) + 1.0
-        if update := density.update(gaussians, Step(iteration, 900, 420)):
-            events.append(iteration)
+            fill(density.stats, random_stats(len(gaussians), step.iteration, seen))
+        due, update = density.event_due(step), density.update(gaussians, step)
+        assert due or update is None
+        if update is not None:
             gaussians = update.apply(gaussians)
             density.apply(update)
-    assert events == [200, 250, 300, 350, 400, 520, 620, 720]  # three final ones, though 820 would have room
-    assert counted == list(range(721))
+        yield step, update, gaussians
 
 
-def test_an_end_that_moves_on_has_room_for_another_event():
-    """A time budget moves the end from 420, whose last event is at 400, to 460, before the run is there."""
-    gaussians = make_gaussians(5)
-    density = ErrorDrivenDensity(refine_every=50, final_keep=1.0, opacity_decay=0.1)
-    density.setup(gaussians)
-    events = [t for t in range(500) if density.update(gaussians, Step(t, 900, 420 if t < 410 else 460))]
-    assert events[-2:] == [400, 450]
+@pytest.mark.parametrize(
+    ("keep", "until", "expected", "end"),
+    [
+        (0.9, 420, [200, 250, 300, 350, 400, 520, 620, 720], 720),  # three final ones, though 820 would have room
+        (1.0, 460, [200, 250, 300, 350, 400, 450], 460),  # a time budget moves the end before the run is there
+    ],
+)
+def test_events_are_when_the_table_says(keep, until, expected, end):
+    """Statistics are kept until the last one."""
+    gaussians = make_gaussians(30)
+    density = controlled(gaussians, refine_every=50, final_every=100, opacity_decay=0.01, final_keep=keep)
+    events, kept = [], 0
+    for step, update, _ in follow(density, gaussians, [Step(t, 900, 420 if t < 410 else until) for t in range(900)]):
+        events += [step.iteration] if update is not None else []
+        kept += density.stats is not None
+    assert (events, kept) == (expected, end)
 
 
 def test_final_pruning_keeps_the_difficult_and_the_unseen():
@@ -211,15 +215,12 @@ def test_split_along_the_long_axis_keeps_mean_and_covariance():
 @pytest.mark.parametrize("split", ["sample", "long_axis"])
 @pytest.mark.parametrize("size", [1e-15, 1e-3, 1e3, 1e25])
 def test_a_split_goes_along_the_axes_that_are_drawn_whatever_the_quaternions_norm(split, size):
-    gaussians = make_gaussians(20, seed=6, dtype=torch.float32)
-
-    def means() -> torch.Tensor:
+    gaussians, means = make_gaussians(20, seed=6, dtype=torch.float32), []
+    for factor in (1.0, size):
+        gaussians.quats *= factor
         density = controlled(gaussians, busy_stats(20), percent_dense=0.0, split=split, **QUIET)
-        return density.update(gaussians, FULL).apply(gaussians).means
-
-    expected = means()
-    gaussians.quats *= size
-    torch.testing.assert_close(means(), expected)
+        means.append(density.update(gaussians, FULL).apply(gaussians).means)
+    torch.testing.assert_close(*means)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -310,17 +311,10 @@ def test_the_cap_holds_at_the_end(cap, keep, every, choose_by, seen, far):
     gaussians = make_gaussians(40, dtype=torch.float32)
     gaussians.means[:20] *= 1e3 if far else 1.0
     density = controlled(gaussians, **settings_of, spare_beyond=10.0, **QUIET, split="long_axis")
-    total, seed = 1500, 0
-    for iteration in range(100, total, 50):
-        step = Step(iteration, total, 800, seed)
-        if density.stats is not None:
-            fill(density.stats, random_stats(len(gaussians), iteration, seen))
-        update = density.update(gaussians, step)
-        if update is not None:
-            gaussians = update.apply(gaussians)
-            density.apply(update)
-            assert len(gaussians) <= density.bound(step) <= 2 * cap
-    assert len(gaussians) <= density.bound(step) == cap
+    steps = [Step(iteration, 1500, 800) for iteration in range(100, 1500, 50)]
+    for step, update, after in follow(density, gaussians, steps, seen):
+        assert update is None or len(after) <= density.bound(step) <= 2 * cap
+    assert len(after) <= density.bound(step) == cap
 
 
 @pytest.mark.parametrize(
@@ -335,36 +329,24 @@ def test_runs_of_any_length_have_as_many_final_prunings(base, refine_until, ever
         assert len(at) == prunings and total - at[-1] >= interval / 2, total
 
 
-def test_a_run_that_becomes_shorter_ends_at_its_cap():
-    """A time budget may leave no room for a final pruning that growth counted on."""
-    gaussians = make_gaussians(120, dtype=torch.float32)
-    density, counts = controlled(gaussians, max_gaussians=100, **QUIET), {}
-    for iteration, total in ((3500, 5000), (4000, 5000), (4050, 4700), (4100, 4700), (4200, 4700)):
-        if density.stats is not None:
-            fill(density.stats, random_stats(len(gaussians), iteration, seen=1.0))
-        step = Step(iteration, total, 3500)
-        due, update = density.event_due(step), density.update(gaussians, step)
-        if update is not None:
-            assert due
-            gaussians = update.apply(gaussians)
-            density.apply(update)
-        counts[iteration] = len(gaussians)
-    assert counts == {3500: 110, 4000: 105, 4050: 105, 4100: 100, 4200: 100} and density.stats is None
-
-
-def test_growth_goes_beyond_the_cap_by_what_final_prunings_remove():
+@pytest.mark.parametrize(
+    ("first", "lengths", "counts"),
+    [
+        (40, {200: 5000, 300: 5000, 3500: 5000, 4000: 5000, 4500: 5000}, [60, 90, 110, 105, 100]),
+        # A time budget may leave no room for a final pruning that growth counted on.
+        (120, {3500: 5000, 4000: 5000, 4050: 4700, 4100: 4700, 4200: 4700}, [110, 105, 105, 100, 100]),
+    ],
+)
+def test_growth_goes_beyond_the_cap_by_what_final_prunings_remove(first, lengths, counts):
     """To the room that they leave, and down again by worth, to the cap itself."""
-    gaussians = make_gaussians(40, dtype=torch.float32)
-    density, counts = controlled(gaussians, max_gaussians=100, percent_dense=0.0, **QUIET), {}
-    for iteration in (200, 300, 3500, 4000, 4500):
-        if density.stats is not None:
-            fill(density.stats, random_stats(len(gaussians), iteration, seen=1.0))
-            density.stats.grad_sums += 1.0
-        least = set(density.scores(Step(iteration, 5000, 3500))[0].argsort()[:4].tolist())
-        update = density.update(gaussians, Step(iteration, 5000, 3500))
-        gaussians = update.apply(gaussians)
-        density.apply(update)
-        counts[iteration] = len(gaussians)
-        if iteration > 3500:
-            assert least.isdisjoint(update.source.tolist())
-    assert counts == {200: 60, 300: 90, 3500: 110, 4000: 105, 4500: 100}
+    before = make_gaussians(first, dtype=torch.float32)
+    density = controlled(before, max_gaussians=100, percent_dense=0.0, grad_threshold=0.0, **QUIET)
+    steps, found = [Step(at, total, 3500) for at, total in lengths.items()], []
+    for step, update, gaussians in follow(density, before, steps):
+        if update is not None and step.iteration > 3500:
+            stats = random_stats(len(before), step.iteration, 1.0)
+            least = controlled(before, stats).scores(step)[0].argsort()[:4]
+            assert set(least.tolist()).isdisjoint(update.source.tolist())
+        found.append(len(gaussians))
+        before = gaussians
+    assert found == counts and density.stats is None

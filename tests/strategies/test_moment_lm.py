@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers.optimizers import STEP, all_finite, clone, equal, make_gaussians, make_gradients, scaled
+from helpers.optimizers import STEP, all_finite, clone, equal, make_gaussians, make_gradients, ready, scaled
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -61,8 +61,7 @@ def expected_delta(rows, losses, mean, square, steps, optimizer) -> np.ndarray:
 def test_equals_numpy(views, config):
     count = 5
     gaussians = make_gaussians(count)
-    optimizer = MomentLMOptimizer(**config)
-    optimizer.setup(gaussians)
+    optimizer = ready(MomentLMOptimizer(**config), gaussians)
     size = 1e-2 if optimizer.units == "paper" else 1e-5  # in the paper's units the coupling fades as gradients do
     mean, square = np.zeros((count, 14)), np.zeros((count, 14))
     for iteration in range(4):
@@ -73,7 +72,7 @@ def test_equals_numpy(views, config):
         if optimizer.rows == "summed":
             rows, losses = rows.sum(axis=0, keepdims=True), losses.sum(axis=0, keepdims=True)
         before = packed(dict(clone(gaussians).items()))
-        optimizer.step(gaussians, make_gradients(views, count, seed=iteration, size=size), STEP)
+        optimizer.step(gaussians, gradients, STEP)
         change = packed(dict(gaussians.items())) - before
         for i in range(count):
             moments = mean[i], square[i], iteration + 1, optimizer
@@ -87,10 +86,9 @@ def test_equals_numpy(views, config):
 @pytest.mark.parametrize("without", ["no shares", "no curvature", "no gradient"])
 def test_without_rows_it_is_adam_to_the_last_bit(dtype, without):
     lm_gaussians, adam_gaussians = make_gaussians(9, dtype=dtype), make_gaussians(9, dtype=dtype)
-    lm = MomentLMOptimizer(eps=1e-15, curvature=0.0 if without == "no curvature" else 0.5)
-    adam = SparseAdam(eps=1e-15)
-    lm.setup(lm_gaussians)
-    adam.setup(adam_gaussians)
+    curvature = 0.0 if without == "no curvature" else 0.5
+    lm = ready(MomentLMOptimizer(eps=1e-15, curvature=curvature), lm_gaussians)
+    adam = ready(SparseAdam(eps=1e-15), adam_gaussians)
     for seed in range(8):
         gradients = make_gradients(3, 9, seed, dtype)
         if without == "no shares" or seed == 0:
@@ -111,9 +109,7 @@ def test_scale_of_the_loss_does_not_matter(factor, dtype, tolerance):
     paths = []
     for scale in (1.0, factor):
         gaussians = make_gaussians(20, dtype=dtype)
-        start = clone(gaussians)
-        optimizer = MomentLMOptimizer()
-        optimizer.setup(gaussians)
+        start, optimizer = clone(gaussians), ready(MomentLMOptimizer(), gaussians)
         for seed in range(20):
             optimizer.step(gaussians, scaled(make_gradients(3, 20, seed, dtype), scale), STEP)
         paths.append({name: value - getattr(start, name) for name, value in gaussians.items()})
@@ -133,9 +129,7 @@ def test_scale_of_the_loss_does_not_matter(factor, dtype, tolerance):
 def test_any_mixture_of_magnitudes_within_a_block(exponents, views, dtype, loss_exponent, seed):
     """1e-30 to 1e30 side by side, rows parallel or not, any share of the loss: finite, no longer than the bound."""
     gaussians = make_gaussians(3, dtype=dtype)
-    start = clone(gaussians)
-    optimizer = MomentLMOptimizer()
-    optimizer.setup(gaussians)
+    start, optimizer = clone(gaussians), ready(MomentLMOptimizer(), gaussians)
     gradients = make_gradients(views, 3, seed, dtype, size=1.0)
     sizes = torch.tensor([10.0**e for e in exponents], dtype=dtype)
     for name, columns in zip(NAMES, sizes.split(WIDTHS), strict=True):
@@ -160,9 +154,7 @@ def test_any_mixture_of_magnitudes_within_a_block(exponents, views, dtype, loss_
 def test_zero_rates_hold_parameters():
     rates = LearningRates(means=0, means_final=0, quats=0)
     gaussians = make_gaussians(5, dtype=torch.float32)
-    before = clone(gaussians)
-    optimizer = MomentLMOptimizer(rates)
-    optimizer.setup(gaussians)
+    before, optimizer = clone(gaussians), ready(MomentLMOptimizer(rates), gaussians)
     optimizer.step(gaussians, make_gradients(3, 5, dtype=torch.float32), STEP)
     assert torch.equal(gaussians.means, before.means) and torch.equal(gaussians.quats, before.quats)
     assert not torch.equal(gaussians.scales, before.scales) and all_finite(gaussians)
@@ -172,8 +164,7 @@ def test_zero_rates_hold_parameters():
 def test_a_useless_share_of_the_loss(share):
     """A share that says nothing drops its row; one that is tiny only stops the motion along it."""
     gaussians = make_gaussians(2, dtype=torch.float32)
-    optimizer = MomentLMOptimizer()
-    optimizer.setup(gaussians)
+    optimizer = ready(MomentLMOptimizer(), gaussians)
     gradients = make_gradients(3, 2, dtype=torch.float32)
     gradients.view_losses[1, 0] = share
     gradients.opacities[1], gradients.sh0[1] = 0.0, 0.0  # this view: no row for the second block
