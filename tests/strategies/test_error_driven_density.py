@@ -10,6 +10,7 @@ import torch
 from helpers.optimizers import all_finite, busy_stats, controlled, fill, make_gaussians, random_stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
@@ -19,15 +20,9 @@ FULL = Step(1200, 3500, 3500, seed=3, scene_extent=2.0)  # past `prune_size_from
 QUIET = {"prune_world_size": 0.0, "prune_opacity": 0.0}
 
 
-def rotation(quat: np.ndarray) -> np.ndarray:
-    w, x, y, z = quat / np.linalg.norm(quat)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def covariance_of(gaussians, row: int) -> np.ndarray:
+    turn = Rotation.from_quat(np.roll(gaussians.quats[row].numpy(), -1)).as_matrix()
+    return turn @ np.diag(np.exp(2 * gaussians.scales[row].numpy())) @ turn.T
 
 
 @pytest.mark.parametrize("kind", ["raw", "balanced"])
@@ -187,10 +182,8 @@ def test_split_draws_from_the_gaussian():
     update = density.update(gaussians, FULL)
     after = update.apply(gaussians)
     assert update.num_split == 20_000 and len(after) == 40_000
-    turn = rotation(one.quats[0].numpy())
-    covariance = turn @ np.diag(np.exp(2 * one.scales[0].numpy())) @ turn.T
     offsets = (after.means - one.means).numpy()
-    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    root = np.linalg.inv(np.linalg.cholesky(covariance_of(one, 0)))
     np.testing.assert_allclose(np.cov((offsets @ root.T).T), np.eye(3), atol=0.03)
     np.testing.assert_allclose((offsets @ root.T).mean(axis=0), 0, atol=0.02)
     torch.testing.assert_close(after.scales, (one.scales - math.log(1.6)).expand(40_000, 3))
@@ -203,12 +196,10 @@ def test_split_along_the_long_axis_keeps_mean_and_covariance():
     assert len(after) == 100
     for i in range(50):
         means = after.means[[i, i + 50]].numpy()
-        turn = rotation(gaussians.quats[i].numpy())
-        expected = turn @ np.diag(np.exp(2 * gaussians.scales[i].numpy())) @ turn.T
-        half = turn @ np.diag(np.exp(2 * after.scales[i].numpy())) @ turn.T
         offset = (means[0] - means[1]) / 2
+        pair = covariance_of(after, i) + np.outer(offset, offset)
         np.testing.assert_allclose(means.mean(axis=0), gaussians.means[i].numpy(), rtol=1e-12)
-        np.testing.assert_allclose(half + np.outer(offset, offset), expected, rtol=1e-10, atol=1e-14)
+        np.testing.assert_allclose(pair, covariance_of(gaussians, i), rtol=1e-10, atol=1e-14)
         assert np.linalg.norm(offset) > 0.7 * math.exp(float(gaussians.scales[i].max()))
 
 

@@ -22,13 +22,9 @@ def screen(seed: int) -> SimpleNamespace:
     generator = torch.Generator().manual_seed(seed)
     gradients = torch.randn(VIEWS, COUNT, 2, generator=generator) * 3e-6
     # One radius in all views that see a Gaussian: of several, gsplat 1.5.3 keeps the last one, not the largest.
-    radii = torch.randint(1, 12, (COUNT, 1), generator=generator) * (
-        torch.rand(VIEWS, COUNT, 1, generator=generator) < 0.7
-    )
-    return SimpleNamespace(
-        gradients=gradients,
-        radii=radii.repeat(1, 1, 2),
-    )
+    sizes = torch.randint(1, 12, (COUNT, 1), generator=generator)
+    radii = sizes * (torch.rand(VIEWS, COUNT, 1, generator=generator) < 0.7)
+    return SimpleNamespace(gradients=gradients, radii=radii.repeat(1, 1, 2))
 
 
 def gsplats_own(gaussians, batch, step: Step, config: dict, repaired: bool):

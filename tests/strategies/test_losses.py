@@ -170,12 +170,10 @@ def test_empty_slots_have_no_part(loss):
     colors, targets, samples = random_case(weighted=True)
     result = loss(colors, targets, samples)
     empty = ~samples.filled
-    assert (result.color_gradients[empty] == 0).all()
-    assert (result.pixel_errors[empty] == 0).all()
+    assert (result.color_gradients[empty] == 0).all() and (result.pixel_errors[empty] == 0).all()
     colors[empty], targets[empty] = torch.nan, torch.inf
     again = loss(colors, targets, samples)
-    assert torch.equal(result.color_gradients, again.color_gradients)
-    assert result.loss == again.loss
+    assert torch.equal(result.color_gradients, again.color_gradients) and result.loss == again.loss
 
 
 def test_pixel_errors_are_l1_norms():
@@ -254,10 +252,8 @@ def test_a_colour_that_is_not_finite_spoils_nothing(loss, bad):
     colors, targets, samples = random_case()
     colors[0, 1] = bad
     result = loss(colors, targets, samples)
-    assert torch.isfinite(result.loss)
-    assert torch.isfinite(result.color_gradients).all()
-    assert (result.color_gradients[0] == 0).all()
-    assert result.pixel_errors[0] == 0
+    assert torch.isfinite(result.loss) and torch.isfinite(result.color_gradients).all()
+    assert (result.color_gradients[0] == 0).all() and result.pixel_errors[0] == 0
 
 
 def test_wrong_shapes_are_named():

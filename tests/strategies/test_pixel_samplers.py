@@ -19,10 +19,8 @@ def test_layout(sampler, unit, rate):
     samples = sampler(unit=unit).sample(maps, views, rate, step(100))
     assert samples.view_ids == views
     assert samples.sizes.tolist() == SIZES[list(views)].tolist()
-    assert samples.weights is None
     offsets, grid = samples.tile_offsets, samples.grid
-    assert offsets[0] == 0
-    assert offsets[-1] == len(samples)
+    assert samples.weights is None and (offsets[0], offsets[-1]) == (0, len(samples))
     assert (samples.tile_ids[1:] > samples.tile_ids[:-1]).all()
     assert [t.dtype for t in (samples.pixel_ids, samples.tile_ids, offsets)] == [torch.int32] * 3
 
@@ -142,11 +140,11 @@ def test_draws_depend_on_seed_and_iteration_alone(unit):
     assert len(set(keys)) == 4
 
 
-def many_tiles(errors, iteration=0, sampler=None, rate=0.1):
+def many_tiles(errors, iteration=0):
     """How often each place of a tile is drawn, [256] in row order, over 400 equal tiles."""
     image = torch.as_tensor(errors).reshape(16, 16).repeat(20, 20)
     maps = ErrorMaps.from_images([image])
-    samples = (sampler or ErrorGuidedPixelSampler()).sample(maps, (0,), rate, step(iteration))
+    samples = ErrorGuidedPixelSampler().sample(maps, (0,), 0.1, step(iteration))
     x, y = (samples.coordinates() % 16).unbind(dim=1)
     return torch.bincount(y * 16 + x, minlength=256).numpy(), samples
 
@@ -162,21 +160,15 @@ def test_tiles_of_one_error_are_drawn_uniformly(value, iteration):
     assert samples.filled.all()
 
 
-def test_one_hot_tile_always_gives_the_hot_pixel_and_else_is_uniform():
+@pytest.mark.parametrize(("hot", "error"), [(slice(77, 78), 1e-3), (slice(100, 110), 6e-8)])
+def test_hot_pixels_are_always_drawn_and_the_others_uniformly(hot, error):
     errors = torch.zeros(256)
-    errors[77] = 1e-3
+    errors[hot] = error
     counts, _ = many_tiles(errors)
-    assert counts[77] == 400
-    p = 24 / 255
-    others = np.delete(counts, 77)
+    assert (counts[hot] == 400).all()
+    others = np.delete(counts, hot)
+    p = (25 - 256 + len(others)) / len(others)
     assert (np.abs(others - 400 * p) < SIGMAS * np.sqrt(400 * p * (1 - p))).all()
-
-
-def test_smallest_error_comes_before_zero_errors():
-    errors = torch.zeros(256)
-    errors[100:110] = 6e-8
-    counts, _ = many_tiles(errors, sampler=ErrorGuidedPixelSampler(hard_ratio=1.0, stable_ratio=0.0))
-    assert (counts[100:110] == 400).all()
 
 
 def test_ages_past_sixteen_bits_still_rank():

@@ -4,12 +4,7 @@ import math
 
 import pytest
 
-from turbogs_plugin.strategies.schedule import (
-    ExponentialSchedule,
-    FixedSchedule,
-    LinearSchedule,
-    SinusoidalSchedule,
-)
+from turbogs_plugin.strategies.schedule import ExponentialSchedule, FixedSchedule, LinearSchedule, SinusoidalSchedule
 from turbogs_plugin.types import Step
 
 ADAPTIVE = [SinusoidalSchedule, LinearSchedule, ExponentialSchedule]
