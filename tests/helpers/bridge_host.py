@@ -76,17 +76,11 @@ def optimizers_of(splats: torch.nn.ParameterDict, optimizer_class: Any) -> dict[
 
 @dataclass
 class Host:
-    """A trainer that fits what other Gaussians look like, in the order of calls of gsplat's.
-
-    Args:
-        strategy: of density control.
-        optimizer_class: of each parameter.
-        tells_errors: put prediction and ground truth into `info`.
-    """
+    """A trainer that fits what other Gaussians look like, in the order of calls of gsplat's."""
 
     strategy: Any
     optimizer_class: Any = torch.optim.Adam
-    tells_errors: bool = False
+    tells_errors: bool = False  # put prediction and ground truth into `info`
     splats: torch.nn.ParameterDict = field(default_factory=make_splats)
 
     def __post_init__(self) -> None:
@@ -101,13 +95,8 @@ class Host:
 
     def step(self, step: int) -> float:
         """One iteration; gives its loss."""
-        colors, _, self.info = sparse_rasterization(
-            **arguments(self.splats, self.cameras),
-            samples=self.samples,
-            sh_degree=1,
-            absgrad=self.strategy.absgrad,
-            packed=False,
-        )
+        options = {"samples": self.samples, "sh_degree": 1, "absgrad": self.strategy.absgrad, "packed": False}
+        colors, _, self.info = sparse_rasterization(**arguments(self.splats, self.cameras), **options)
         common = {"params": self.splats, "optimizers": self.optimizers, "state": self.state, "step": step}
         self.strategy.step_pre_backward(**common, info=self.info)
         if self.tells_errors:

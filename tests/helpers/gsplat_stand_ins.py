@@ -1,5 +1,6 @@
 """What stands for parts of gsplat that need a GPU, or that its release does not have."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -69,17 +70,13 @@ def rendered_info() -> dict[str, Any]:
     return info
 
 
+@dataclass
 class Scene:
-    """`gsplat.scene.GaussianScene` of gsplat 1.6 as strategies see it: hooks that keep further rows with Gaussians.
+    """`gsplat.scene.GaussianScene` of gsplat 1.6 as strategies see it: hooks that keep further rows with Gaussians."""
 
-    Args:
-        signal: name -> [N, ...]. component_index: [N] int64.
-    """
-
-    def __init__(
-        self, splats: torch.nn.ParameterDict, signal: dict[str, torch.Tensor], component_index: torch.Tensor
-    ) -> None:
-        self.splats, self.signal, self.component_index = splats, signal, component_index
+    splats: torch.nn.ParameterDict
+    signal: dict[str, torch.Tensor]  # name -> [N, ...]
+    component_index: torch.Tensor  # [N] int64
 
     def on_duplicate(self, sel: torch.Tensor) -> None:
         assert sel.dtype == torch.int64

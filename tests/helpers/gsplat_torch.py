@@ -15,20 +15,13 @@ from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 @dataclass
 class Drawn:
-    """What was drawn of one view.
+    """What was drawn of one view. The gradients of the distances are the terms of the gradient on the screen."""
 
-    Args:
-        order: [S] the Gaussians in the order of drawing. slots: [n] the samples of the view.
-        distances: [n, S, 2] of the Gaussians' means from the pixels' centres; their gradients are the terms of the
-            gradient on the screen.
-        weights, sigmas: [n, S], see `weights_of`.
-    """
-
-    order: Tensor
-    slots: Tensor
-    distances: Tensor
-    weights: Tensor
-    sigmas: Tensor
+    order: Tensor  # [S] the Gaussians in the order of drawing
+    slots: Tensor  # [n] the samples of the view
+    distances: Tensor  # [n, S, 2] of the Gaussians' means from the pixels' centres
+    weights: Tensor  # [n, S], see `weights_of`
+    sigmas: Tensor  # [n, S]
 
 
 def gsplat_torch_render(
@@ -39,11 +32,8 @@ def gsplat_torch_render(
     settings: RasterSettings = DEFAULT_SETTINGS,
     drawn: list[Drawn] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours [P, 3], alphas [P] and expected depths [P] at the samples; zero in empty slots.
-
-    Args:
-        drawn: list that takes what was drawn of each view; the distances there keep their gradients.
-    """
+    """Colours [P, 3], alphas [P] and expected depths [P] at the samples; zero in empty slots. `drawn` takes what was
+    drawn of each view; the distances there keep their gradients."""
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     covars, _ = _quat_scale_to_covar_preci(gaussians.quats, gaussians.scales.exp(), True, False)
     coefficients = torch.cat([gaussians.sh0, gaussians.shN], dim=1)
@@ -51,20 +41,10 @@ def gsplat_torch_render(
     places, views = samples.coordinates().to(gaussians.means) + 0.5, samples.view_of_slot()
     result = gaussians.means.new_zeros(len(samples), 5)
     for view, (width, height) in enumerate(cameras.sizes.tolist()):
-        radii, means2d, depths, conics, _ = (
-            value[0] if value is not None else None
-            for value in _fully_fused_projection(
-                gaussians.means,
-                covars,
-                cameras.viewmats[view : view + 1],
-                cameras.Ks[view : view + 1],
-                width,
-                height,
-                settings.eps2d,
-                settings.near_plane,
-                settings.far_plane,
-            )
-        )
+        camera = (cameras.viewmats[view : view + 1], cameras.Ks[view : view + 1], width, height)
+        limits = (settings.eps2d, settings.near_plane, settings.far_plane)
+        projected = _fully_fused_projection(gaussians.means, covars, *camera, *limits)
+        radii, means2d, depths, conics = (value[0] for value in projected[:4])
         directions = gaussians.means - cameras.centers[view]
         colors = (_spherical_harmonics(degree, directions, coefficients) + 0.5).clamp(min=0)
         order = depths.argsort(stable=True)
@@ -85,12 +65,8 @@ def gsplat_torch_render(
 def weights_of(
     distances: Tensor, conics: Tensor, opacities: Tensor, settings: RasterSettings = DEFAULT_SETTINGS
 ) -> tuple[Tensor, Tensor]:
-    """[n, S] the weight of each Gaussian in each pixel, and half its squared Mahalanobis distance from there.
-
-    Args:
-        distances: [n, S, 2] of the means, in the order of drawing, from the pixels' centres.
-        conics: [S, 3]. opacities: [S] after sigmoid.
-    """
+    """[n, S] the weight of each Gaussian in each pixel, and half its squared Mahalanobis distance from there, given
+    `Drawn.distances`, conics [S, 3] and opacities [S] after the sigmoid."""
     dx, dy = distances.unbind(dim=-1)
     a, b, c = conics.unbind(dim=-1)
     sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy

@@ -26,12 +26,8 @@ def seen_by(
 
 
 def painted_photo(size: tuple[int, int], pixels: np.ndarray) -> np.ndarray:
-    """[H, W, 3] uint8, black but for a pixel a point.
-
-    Args:
-        size: (width, height).
-        pixels: [3, 2] float64 image coordinates (x, y), the centre of the first pixel at (0.5, 0.5).
-    """
+    """[H, W, 3] uint8, black but for a pixel a point; [3, 2] image coordinates (x, y), the centre of the first pixel at
+    (0.5, 0.5)."""
     width, height = size
     photo = np.zeros((height, width, 3), dtype=np.uint8)
     for color, (x, y) in zip(COLORS, np.floor(pixels).astype(int), strict=True):
@@ -41,11 +37,8 @@ def painted_photo(size: tuple[int, int], pixels: np.ndarray) -> np.ndarray:
 
 
 def require_points_at_their_pixels(scene: Scene, views: PosedImages, points: np.ndarray) -> None:
-    """Each point, projected by each loaded camera, lies within the pixel that has its colour in the loaded photo.
-
-    Args:
-        points: [3, 3] float64 in the capture's own coordinates.
-    """
+    """Each point [3, 3], in the capture's own coordinates, projected by each loaded camera, lies within the pixel that
+    has its colour in the loaded photo."""
     normalised = scene.frame.normalise_points(points)
     for view in range(len(views)):
         viewmat, K = (array[view].double().numpy() for array in (views.cameras.viewmats, views.cameras.Ks))

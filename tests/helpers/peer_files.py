@@ -25,19 +25,14 @@ class PeerFiles:
     Args:
         pauses: seconds, at most, that a process waits before and after a barrier, so that a missing one shows.
         most: memories that can be had; then there are none. None: as many as wanted.
-
-    Attributes:
-        sizes: of each memory that was made.
-        refused: how often there was none.
-        barriers: the numbers of all barriers.
     """
 
     def __init__(self, folder: Path, pauses: float = 0.004, most: int | None = None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder, self.pauses, self.most = folder, pauses, most
-        self.sizes: list[int] = []
-        self.refused = 0
-        self.barriers: list[int] = []
+        self.sizes: list[int] = []  # of each memory that was made
+        self.refused = 0  # how often there was none
+        self.barriers: list[int] = []  # the numbers of all
 
     def __call__(self, ranks: ProcessRanks, size: int, device: torch.device) -> PeerMemory | None:
         if self.most is not None and len(self.sizes) >= self.most:

@@ -58,13 +58,8 @@ def make_case(
     origin: tuple[int, int] = (0, 0),
     device: str = "cuda",
 ) -> Case:
-    """Random Gaussians seen by cameras of these image sizes.
-
-    Args:
-        rate: share of each tile's pixels; below 1 some tiles have no samples at all.
-        log_scale: added to the logarithms of the scales.
-        origin: of the grid of tiles.
-    """
+    """Random Gaussians seen by cameras of these image sizes. `rate`: share of each tile's pixels; below 1 some tiles
+    have no samples at all. `log_scale`: added to scales. `origin`: of the grid of tiles."""
     gaussians = make_gaussians(count, seed, torch.float32)
     gaussians.scales += log_scale
     cameras = make_cameras(sizes, torch.float32)

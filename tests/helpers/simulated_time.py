@@ -13,11 +13,7 @@ from turbogs_plugin.train.trainer import Trainer
 
 
 class SimulatedTime:
-    """`time.perf_counter`, which stands still until it is told that time passes.
-
-    Args:
-        tick: seconds that pass whenever it is read.
-    """
+    """`time.perf_counter`, which stands still until it is told that time passes, but for `tick` seconds a look."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, tick: float = 0.0) -> None:
         self.now, self.tick = 1000.0, tick

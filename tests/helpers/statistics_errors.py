@@ -30,17 +30,11 @@ LOOKS, ROWS = 12_800, 10_000
 
 @dataclass(frozen=True)
 class StatisticsCase:
-    """A model, and the gradients that come from above.
-
-    Args:
-        name: for tables.
-        change: makes the model of the case from `surface_gaussians`' model, in place.
-        gradient: size of the colours' gradients times the number of samples.
-    """
+    """A model, and the gradients that come from above."""
 
     name: str
-    change: Callable[[Gaussians], object] = lambda gaussians: None
-    gradient: float = 1.0
+    change: Callable[[Gaussians], object] = lambda gaussians: None  # of `surface_gaussians`' model, in place
+    gradient: float = 1.0  # size of the colours' gradients times the number of samples
 
 
 CASES = (
@@ -61,18 +55,14 @@ CASES = (
 class StatisticsErrors:
     """Errors of one case.
 
-    Args:
-        case: its name.
-        errors: name of a sum -> L2 of the difference over L2.
-        median_square, worst_square: relative errors of single sums of squares, over the Gaussians with at least 1e-4 of
-            the mean sum. A draw's chances are off by as much.
-        exchanged: of the 5 % of the least sums of squares, the share that float64 has not among them. Over the
-            Gaussians with a sum, as equal ones are not removed.
+    Single sums of squares are those of the Gaussians with at least 1e-4 of the mean sum; a draw's chances are off by as
+    much. `exchanged`: of the 5 % of the least sums of squares, the share that float64 has not among them, over the
+    Gaussians with a sum, as equal ones are not removed.
     """
 
     case: str
-    errors: dict[str, float]
-    median_square: float
+    errors: dict[str, float]  # name of a sum -> L2 of the difference over L2
+    median_square: float  # relative
     worst_square: float
     exchanged: float
 

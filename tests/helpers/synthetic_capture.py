@@ -15,13 +15,9 @@ from turbogs_plugin.scene.geometry import look_at
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.types import SH_C0, Cameras, Gaussians
 
-RING_RADIUS = 3.0
-"""Distance of the cameras from the vertical axis."""
-
-POINT_NOISE = 0.01
-"""Standard deviation of the points' noise."""
-EXTENT_MARGIN, TEST_EVERY = 1.1, 8
-"""Value of 3DGS."""
+RING_RADIUS = 3.0  # distance of the cameras from the vertical axis
+POINT_NOISE = 0.01  # standard deviation
+EXTENT_MARGIN, TEST_EVERY = 1.1, 8  # 3DGS's
 
 
 def ring_cameras(count: int, width: int, height: int, device: torch.device) -> Cameras:
@@ -63,14 +59,8 @@ def surface_gaussians(count: int, device: torch.device, seed: int = 0) -> Gaussi
 
 @torch.no_grad()
 def synthetic_scene(views: int, width: int, height: int, device: torch.device, gaussians: int) -> Scene:
-    """A scene whose photos are renders of `surface_gaussians`, in host memory.
-
-    Args:
-        views: photos in all, from a ring of cameras; every eighth one tests.
-        width, height: of each.
-        device: where to render them.
-        gaussians: of the model that is photographed. A quarter of them are the points of the reconstruction.
-    """
+    """A scene in host memory, whose photos, every eighth of which tests, are renders on the device of
+    `surface_gaussians`; a quarter of these are the points of the reconstruction."""
     model = surface_gaussians(gaussians, device)
     cameras = ring_cameras(views, width, height, device)
     test = np.arange(views) % TEST_EVERY == 0

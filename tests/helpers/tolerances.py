@@ -10,19 +10,13 @@ import torch
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Bounds of one dtype against float64.
+    """Bounds of one dtype against float64. Needles are a million times as long as thick; images thousands of pixels
+    wide count as such."""
 
-    Args:
-        pixel: colour of a sample, over the largest colour (at least 1).
-        needle_pixel: the same where splats are a million times as long as thick, or images thousands of pixels wide.
-        gradient: of a parameter, as a tensor: L2 of the difference over L2.
-        needle_gradient: the same for needles, whose thickness has next to no gradient.
-    """
-
-    pixel: float
+    pixel: float  # colour of a sample, over the largest colour (at least 1)
     needle_pixel: float
-    gradient: float
-    needle_gradient: float
+    gradient: float  # of a parameter, as a tensor: L2 of the difference over L2
+    needle_gradient: float  # a needle's thickness has next to no gradient
 
 
 TOLERANCES = {torch.float32: Tolerance(pixel=5e-6, needle_pixel=2e-4, gradient=5e-5, needle_gradient=5e-3)}
@@ -36,18 +30,12 @@ STRUCTURE_BOUND = 1e-3
 
 @dataclass(frozen=True)
 class StatisticsTolerance:
-    """Bounds of density control's sums in float32 (`helpers.statistics_errors.StatisticsErrors`).
+    """Bounds of density control's sums in float32 (`helpers.statistics_errors.StatisticsErrors`)."""
 
-    Args:
-        total: of the vector of a sum over all Gaussians, L2 of the difference over L2.
-        median_square, worst_square: relative, of single sums of squares.
-        exchanged: share of those that a turnover of 5 % takes in the place of others.
-    """
-
-    total: float
-    median_square: float
+    total: float  # of the vector of a sum over all Gaussians, L2 of the difference over L2
+    median_square: float  # relative, of single sums of squares
     worst_square: float
-    exchanged: float
+    exchanged: float  # share of those that a turnover of 5 % takes in the place of others
 
 
 STATISTICS = StatisticsTolerance(total=1e-5, median_square=1e-4, worst_square=2e-2, exchanged=0.02)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from turbogs_plugin.captures.bundle_adjustment import Pinholes
 from turbogs_plugin.scene.scene import Observations
@@ -17,18 +18,12 @@ WIDTH, HEIGHT, FOCAL = 640, 480, 560.0
 
 @dataclass
 class Tracked:
-    """V photos of M points.
+    """V photos of M points."""
 
-    Args:
-        true, given: the cameras as they are, and as a reconstruction has them.
-        points: [M, 3], as they are.
-        observations: what photos show, with some noise.
-    """
-
-    true: Pinholes
-    given: Pinholes
-    points: np.ndarray
-    observations: Observations
+    true: Pinholes  # the cameras as they are
+    given: Pinholes  # and as a reconstruction has them
+    points: np.ndarray  # [M, 3], as they are
+    observations: Observations  # what photos show, with some noise
 
     def seen(self, cameras: Pinholes, points: np.ndarray | None = None) -> np.ndarray:
         """[O, 2] pixels where cameras see the points of the observations."""
@@ -58,9 +53,8 @@ def tracked(
     rotations, translations = np.zeros((views, 3, 3)), np.zeros((views, 3))
     for view in range(views):
         across, down = 0.9 * np.sin(2.4 * view), 0.5 * np.cos(1.7 * view)
-        turn = np.array([[np.cos(across), 0, np.sin(across)], [0, 1, 0], [-np.sin(across), 0, np.cos(across)]])
-        tilt = np.array([[1, 0, 0], [0, np.cos(down), -np.sin(down)], [0, np.sin(down), np.cos(down)]])
-        rotations[view], translations[view] = tilt @ turn, [0.0, 0.0, 4.0 + 0.3 * np.sin(view)]
+        rotations[view] = Rotation.from_euler("yx", [across, down]).as_matrix()  # first across, then down
+        translations[view] = [0.0, 0.0, 4.0 + 0.3 * np.sin(view)]
     middle = np.tile([0.5 * WIDTH, 0.5 * HEIGHT], (views, 1))
     half_widths = np.full(views, 0.5 * WIDTH)
     given = Pinholes(rotations, translations, np.full((views, 2), FOCAL), middle, half_widths)
@@ -73,23 +67,16 @@ def tracked(
 
 
 def write_tracked(
-    folder: Path,
-    case: Tracked,
-    suffix: str = ".bin",
-    model: str = "PINHOLE",
-    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0),
+    folder: Path, case: Tracked, suffix: str = ".bin", model: str = "PINHOLE", distortion: tuple[float, ...] = ()
 ) -> Path:
-    """A COLMAP capture of it: the given cameras, photos of noise, and the points with their tracks.
-
-    Args:
-        distortion: of the model OPENCV, which bends what photos show.
-    """
+    """A COLMAP capture of it: the given cameras, photos of noise, and the points with their tracks. `distortion`: of
+    the model OPENCV, which bends what photos show."""
     reconstruction = pycolmap.Reconstruction()
     random = np.random.default_rng(1)
     views, count = len(case.given.focal), len(case.points)
     for view in range(views):
         straight = [*case.given.focal[view], *case.given.centers[view]]
-        params = straight if model == "PINHOLE" else [*straight, *distortion]
+        params = straight if model == "PINHOLE" else [*straight, *(distortion or (0.0,) * 4)]
         camera = pycolmap.Camera(camera_id=view + 1, model=model, width=WIDTH, height=HEIGHT, params=params)
         reconstruction.add_camera_with_trivial_rig(camera)
         pose = pycolmap.Rigid3d(np.c_[case.given.rotations[view], case.given.translations[view]])
@@ -98,9 +85,8 @@ def write_tracked(
             rays = (shown - case.given.centers[view]) / case.given.focal[view]
             shown = camera.img_from_cam(np.c_[rays, np.ones(len(rays))])
         # A first feature without a point, as most have none.
-        image = pycolmap.Image(
-            f"{view:02d}.png", np.vstack([[1.0, 2.0], shown]), camera_id=view + 1, image_id=10 * view + 3
-        )
+        features, numbers = np.vstack([[1.0, 2.0], shown]), {"camera_id": view + 1, "image_id": 10 * view + 3}
+        image = pycolmap.Image(f"{view:02d}.png", features, **numbers)
         reconstruction.add_image_with_trivial_frame(image, pose)
         path = folder / "images" / image.name
         path.parent.mkdir(parents=True, exist_ok=True)

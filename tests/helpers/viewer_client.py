@@ -22,15 +22,10 @@ from turbogs_plugin.viewer.camera import ViewerCamera
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame as it arrived.
+    """A frame as it arrived."""
 
-    Args:
-        lossless: PNG, not JPEG.
-        data: the file.
-    """
-
-    lossless: bool
-    data: bytes
+    lossless: bool  # PNG, not JPEG
+    data: bytes  # the file
 
     def pixels(self) -> np.ndarray:
         """[H, W, 3] uint8."""
@@ -38,12 +33,7 @@ class Frame:
 
 
 class ViewerClient:
-    """A connection to a viewer, as a context.
-
-    Args:
-        url: of the page, ``http://``.
-        headers: further ones of the request.
-    """
+    """A connection to a viewer, as a context; `headers`: further ones of the request."""
 
     def __init__(self, url: str, **headers: str) -> None:
         import viser
