@@ -27,10 +27,9 @@ def imported_rooms(file: Path) -> set[str]:
     """The parts of `turbogs_plugin` that a file imports, at its top or later."""
     modules = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            modules |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            modules |= {f"{node.module}.{alias.name}" for alias in node.names}
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            within = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
+            modules |= {within + alias.name for alias in node.names}
     split = (module.split(".") for module in modules)
     return {parts[1] for parts in split if parts[0] == "turbogs_plugin"}
 
@@ -59,9 +58,8 @@ def test_every_built_in_strategy_is_exported():
 
 def test_readmes_three_lines(tmp_path):
     """README's lines run as printed, on a smaller capture and for fewer iterations."""
-    (block,) = re.findall(
-        r"```python\nimport turbogs_plugin\n\n(scene = .*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S
-    )
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```python\nimport turbogs_plugin\n\n(scene = .*?)```", readme, re.S)
     assert len(block.strip().splitlines()) == 3
     capture = write_demo_capture(tmp_path / "capture", views=8, width=48, height=40)
     short = 'fit(scene, "train.iterations=2", "train.refine_until=1", "train.device=cpu", '

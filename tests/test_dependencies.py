@@ -99,17 +99,14 @@ def test_the_extra_is_what_the_commands_name(project):
 
 
 COMMANDS = {
-    "train": ("SCENE", "--out", "RUN"),
-    "reconstruct": ("PHOTOS", "--out", "SCENE"),
-    "plan": ("SCENE",),
-    "view": ("RUN",),
-    "eval": ("RUN",),
-    "render": ("RUN",),
-    "export": ("RUN",),
-    "ablate": ("components", "--scene", "SCENE", "--out", "STUDY"),
-    "report": ("STUDY",),
-    "bench": ("step", "--scene", "SCENE", "--ply", "MODEL", "--device", "cpu"),
-    "demo": ("CAPTURE",),
+    "train": "SCENE --out RUN",
+    "reconstruct": "PHOTOS --out SCENE",
+    **dict.fromkeys(("view", "eval", "render", "export"), "RUN"),
+    "plan": "SCENE",
+    "report": "STUDY",
+    "demo": "CAPTURE",
+    "ablate": "components --scene SCENE --out STUDY",
+    "bench": "step --scene SCENE --ply MODEL --device cpu",
 }
 ALL_COMMANDS = """
 import contextlib, io, json
@@ -132,7 +129,7 @@ print(json.dumps(answers))
 def said(tmp_path_factory) -> list[str]:
     """What a process without the extra prints: the commands' answers as JSON, what the use of the parts ends with, and
     the commands' answers with the parser, by which each comes to the first package that it lacks itself."""
-    lines = [["doctor"], *([command, *arguments] for command, arguments in COMMANDS.items())]
+    lines = [["doctor"], *([command, *arguments.split()] for command, arguments in COMMANDS.items())]
     code, folder = ALL_COMMANDS.format(lines=lines), tmp_path_factory.mktemp("lacking")
     script = "\n".join([BLOCKED.format(absent=sorted(COMMAND_PACKAGES)), code, USE, "ABSENT.discard('tyro')", code])
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "TURBOGS_LIBRARY": str(folder / "no kernels")}
@@ -206,11 +203,8 @@ def test_an_extra_is_the_one_that_its_message_names(project):
     from turbogs_plugin.report import tensorboard
     from turbogs_plugin.viewer import server
 
-    extras = {
-        "viewer": ("viser", server),
-        "video": ("imageio-ffmpeg", renders),
-        "tensorboard": ("tensorboard", tensorboard),
-    }
+    extras = {"viewer": ("viser", server), "video": ("imageio-ffmpeg", renders)}
+    extras["tensorboard"] = ("tensorboard", tensorboard)
     for extra, (package, module) in extras.items():
         assert set(requirements(project["optional-dependencies"][extra])) == {package}
         assert shlex.split(module.INSTALL) == ["pip", "install", *project["optional-dependencies"][extra]]

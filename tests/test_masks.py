@@ -41,10 +41,8 @@ def live_tiles(keep):
     """Per view the numbers of the tiles that have a pixel, and their pixels."""
     found = []
     for mask in keep:
-        width = mask.shape[1]
-        columns = -(-width // TILE_SIZE)
-        y, x = np.nonzero(mask.numpy())
-        tiles = y // TILE_SIZE * columns + x // TILE_SIZE
+        width, (y, x) = mask.shape[1], np.nonzero(mask.numpy())
+        tiles = y // TILE_SIZE * -(-width // TILE_SIZE) + x // TILE_SIZE
         found.append({tile: set((y * width + x)[tiles == tile].tolist()) for tile in np.unique(tiles).tolist()})
     return found
 
@@ -60,15 +58,11 @@ def test_live_tiles_are_those_with_a_pixel():
         table = pixel_table(SIZES[[view]], "cpu")[tiles]
         kept = [set(row[bits & (row >= 0)].tolist()) for row, bits in zip(table, live, strict=True)]
         assert dict(zip(tiles.tolist(), kept, strict=True)) == expected[view]
-    assert len(masks.bits) == 1 + 1 + 4 + 4  # whole tiles share a row; the half plane cuts three tiles, noise one more
-    assert masks.rows[masks.offsets[WHOLE]] == 0
-
-
-def test_pixels_of_masks_are_those_of_the_image():
-    keep = images()[4]
-    found, expected = PixelMasks.from_images([keep]).pixels([0]), PixelSamples.from_mask(keep)
+    found, expected = PixelMasks.from_images([keep[4]]).pixels([0]), PixelSamples.from_mask(keep[4])
     for name in ("pixel_ids", "tile_ids", "tile_offsets", "view_ids"):
         assert np.array_equal(getattr(found, name), getattr(expected, name)), name
+    assert len(masks.bits) == 1 + 1 + 4 + 4  # whole tiles share a row; the half plane cuts three tiles, noise one more
+    assert masks.rows[masks.offsets[WHOLE]] == 0
 
 
 class Foreign:
@@ -108,13 +102,11 @@ def test_no_sampler_draws_a_masked_pixel_or_a_tile_without_another(sampler, rate
     live = {int(firsts[k]) + tile: kept for k, view in enumerate(views) for tile, kept in expected[view].items()}
     drawn = pixels_by_tile(samples)
     for tile, pixels in drawn.items():
-        assert pixels and set(pixels) <= live[tile]
-        assert len(set(pixels)) == len(pixels)
+        assert pixels and set(pixels) <= live[tile] and len(set(pixels)) == len(pixels)
     if getattr(sampler, "unit", "pixel") == "pixel" and not isinstance(sampler, Foreign):
         wanted = 256 if isinstance(sampler, DensePixelSampler) else max(1, int(256 * rate))
-        assert {tile: len(pixels) for tile, pixels in drawn.items()} == {
-            tile: min(wanted, len(kept)) for tile, kept in live.items()
-        }
+        counts = {tile: min(wanted, len(kept)) for tile, kept in live.items()}
+        assert {tile: len(pixels) for tile, pixels in drawn.items()} == counts
     if rate == 1.0 and not isinstance(sampler, Foreign):
         assert {tile: set(pixels) for tile, pixels in drawn.items()} == live
     if samples.weights is not None and drawn:

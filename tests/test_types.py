@@ -25,10 +25,14 @@ def assert_in_order(samples: PixelSamples) -> None:
     x, y = samples.coordinates().unbind(dim=-1)
     tiles, ranks = samples.tile_of_slot(), sample_order(x % 16, y % 16)
     assert ((tiles.diff() > 0) | (ranks.diff() > 0)).all()
-    starts, columns = TileGrid(samples.sizes).starts[:-1], TileGrid(samples.sizes).shapes[:, 0]
-    views = samples.view_of_slot()
-    places = torch.as_tensor(starts)[views] + y // 16 * torch.as_tensor(columns)[views] + x // 16
-    assert torch.equal(samples.tile_ids[tiles].long(), places)
+    assert_in_their_tiles(samples)
+
+
+def assert_in_their_tiles(samples: PixelSamples) -> None:
+    (x, y), grid, views = samples.coordinates().unbind(dim=-1), samples.grid, samples.view_of_slot()
+    column, line = (x + samples.origin[0]) // 16, (y + samples.origin[1]) // 16
+    places = torch.as_tensor(grid.starts)[views] + line * torch.as_tensor(grid.shapes)[views, 0] + column
+    assert torch.equal(samples.tile_ids[samples.tile_of_slot()].long(), places)
 
 
 def test_all_pixels_are_the_dense_samples():
@@ -43,12 +47,8 @@ def test_a_grid_may_begin_before_its_images(origin):
     grid = TileGrid(SIZES, origin)
     samples = dense_on_grid(SIZES, origin)
     assert samples.origin == origin and len(samples.grid) == len(grid) == grid.starts[-1]
-    x, y = samples.coordinates().unbind(dim=-1)
-    column, line = (x + origin[0]) // 16, (y + origin[1]) // 16
     assert grid.shapes.tolist() == [[(w + origin[0] + 15) // 16, (h + origin[1] + 15) // 16] for w, h in SIZES.tolist()]
-    views = samples.view_of_slot()
-    places = torch.as_tensor(grid.starts)[views] + line * torch.as_tensor(grid.shapes)[views, 0] + column
-    assert torch.equal(samples.tile_ids[samples.tile_of_slot()].long(), places)
+    assert_in_their_tiles(samples)
     second = samples.of_tiles(slice(int(grid.starts[1]), len(grid)), slice(1, 2), slice(37 * 21, 37 * 21 + 16 * 50))
     assert second.tile_ids[0] == 0 and second.origin == origin and (second.view_of_slot() == 0).all()
 
@@ -73,14 +73,10 @@ def test_a_view_without_pixels_stays_in_the_batch():
     assert samples.tile_ids.tolist() == [17]  # of 3 * 6
 
 
-@pytest.mark.parametrize(
-    "mask",
-    [torch.ones(4, 4), torch.ones(4, dtype=torch.bool), np.ones((4, 4), bool), torch.zeros(4, 4).bool()],
-    ids=str,
-)
-def test_a_mask_that_does_not_fit_is_refused(mask):
-    with pytest.raises(InputError, match="a tensor of bool"):
-        PixelSamples.from_mask(mask)
+def test_a_mask_that_does_not_fit_is_refused():
+    for mask in (torch.ones(4, 4), torch.ones(4).bool(), np.ones((4, 4), bool), torch.zeros(4, 4).bool()):
+        with pytest.raises(InputError, match="a tensor of bool"):
+            PixelSamples.from_mask(mask)
     with pytest.raises(InputError, match="expected 2 different numbers of views"):
         PixelSamples.from_mask(torch.ones(2, 4, 4, dtype=torch.bool), (4, 4))
 

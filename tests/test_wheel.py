@@ -44,11 +44,9 @@ def library(numbers: list[str]) -> bytes:
 
 def wheel(folder: Path, content: bytes, name: str = NAME, stray: str | None = None) -> Path:
     with zipfile.ZipFile(folder / name, "w") as archive:
-        mark = "turbogs_plugin/py.typed"
-        for file in ("turbogs_plugin/cli.py", "turbogs_plugin/configs/ablations/parts.yaml", mark, stray):
-            if file:
-                archive.writestr(file, "")
-        archive.writestr("turbogs_plugin-0.1.0.dist-info/WHEEL", "")
+        files = [f"turbogs_plugin/{name}" for name in ("cli.py", "configs/ablations/parts.yaml", "py.typed")]
+        for file in (*files, "turbogs_plugin-0.1.0.dist-info/WHEEL", *([stray] if stray else [])):
+            archive.writestr(file, "")
         archive.writestr("turbogs_plugin/_C.abi3.so", content)
     return folder / name
 
@@ -72,10 +70,10 @@ def test_a_fault_of_a_wheel_is_named(checker, tmp_path, content, options, words)
     assert words in checker.faults(wheel(tmp_path, content, **options), ARCHITECTURES)[0]
 
 
-@pytest.mark.parametrize(
-    "symbol",
-    ["at::Tensor::dim() const", "c10::Error::what() const", "std::vector<at::Tensor>::~vector()", "PyList_New"],
-)
+TIES = ("at::Tensor::dim() const", "c10::Error::what() const", "std::vector<at::Tensor>::~vector()", "PyList_New")
+
+
+@pytest.mark.parametrize("symbol", TIES)
 def test_what_ties_a_library_to_a_version_is_named(checker, tmp_path, monkeypatch, symbol):
     monkeypatch.setattr(checker, "undefined_symbols", lambda library: [*SYMBOLS, symbol])
     (fault,) = checker.faults(wheel(tmp_path, library(ARCHITECTURES)), ARCHITECTURES)
