@@ -12,16 +12,9 @@ from hypothesis import strategies as st
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.provenance import Provenance
+from turbogs_plugin.study import results
 from turbogs_plugin.study.grid import Ablation, CellKey
-from turbogs_plugin.study.results import (
-    CellResult,
-    Study,
-    StudyFolder,
-    changes,
-    curve_and_final,
-    flat_settings,
-    with_changes,
-)
+from turbogs_plugin.study.results import CellResult, Study, StudyFolder, curve_and_final, flat_settings
 from turbogs_plugin.train.history import Evaluation
 
 HERE = Provenance("a machine", {"torch": "2"}, "none", "abc")
@@ -42,10 +35,9 @@ def result(variant: str, seed: int, scene: str = "fox", **changed) -> CellResult
 
 
 def study() -> Study:
-    results = [result(variant, seed) for variant in ABLATION.variants for seed in (0, 1)]
-    results[3] = replace(results[3], provenance=replace(HERE, machine="another"), capture="")
-    results.append(result("base", 0, "h", provenance=None, lpips_reason="no weights"))
-    return Study(ABLATION, results)
+    cells = [result(variant, seed) for variant in ABLATION.variants for seed in (0, 1)]
+    cells[3] = replace(cells[3], provenance=replace(HERE, machine="another"), capture="")
+    return Study(ABLATION, [*cells, result("base", 0, "h", provenance=None, lpips_reason="no weights")])
 
 
 @pytest.fixture
@@ -97,8 +89,8 @@ FLAT = st.dictionaries(st.sampled_from(["loss.type", "loss.rate", "density.until
 
 @given(FLAT, FLAT)
 def test_settings_are_restored_from_their_changes(common, own):
-    changed = json.loads(json.dumps(changes(common, own)))
-    assert with_changes(common, changed) == own and changes(own, own) == {}
+    changed = json.loads(json.dumps(results.changes(common, own)))
+    assert results.with_changes(common, changed) == own and results.changes(own, own) == {}
 
 
 def test_a_cell_that_is_not_in_the_results_yet_is_not_lost(folder):
@@ -111,10 +103,8 @@ def test_a_cell_that_is_not_in_the_results_yet_is_not_lost(folder):
     assert len(folder.read_study().results) == 6
 
 
-def test_a_claimed_cell_is_one_s_alone_until_it_is_left(tmp_path):
+def test_a_claimed_cell_is_one_s_alone(tmp_path):
     first, second = StudyFolder(tmp_path), StudyFolder(tmp_path)
     key, other = CellKey("fox", "a.b[1]", 3), CellKey("fox", "a.b[1]", 31)
     with first.claimed(key) as mine, second.claimed(key) as taken, second.claimed(other) as free:
         assert (mine, taken, free) == (True, False, True)
-    with second.claimed(key) as mine:
-        assert mine
