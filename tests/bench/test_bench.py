@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers.framework_runs import tiny_config
+from helpers.framework_runs import assert_identical, tiny_config
 from helpers.simulated_time import OperatorTime, SimulatedTime
 from helpers.synthetic_capture import surface_gaussians
 
@@ -41,9 +41,8 @@ def test_clocks_measure_what_passes(monkeypatch):
 
 
 def test_the_recorder_marks_the_trainers_own_steps_and_leaves_no_trace(capture, monkeypatch):
-    config = tiny_config(capture).without_plan()
+    config, recorder, operators = tiny_config(capture).without_plan(), Recorder(CPU), OperatorTime(monkeypatch)
     plain, watched = (Trainer(config, load_scene(capture), CPU) for _ in range(2))
-    recorder, operators = Recorder(CPU), OperatorTime(monkeypatch)
     for trainer in (plain, watched):
         trainer.initialise_maps()
     with operators, recorded(watched, recorder) as iteration:
@@ -52,8 +51,7 @@ def test_the_recorder_marks_the_trainers_own_steps_and_leaves_no_trace(capture, 
     watched.step()
     for _ in range(3):
         plain.step()
-    for (_, one), (_, other) in zip(plain.gaussians.items(), watched.gaussians.items(), strict=True):
-        assert torch.equal(one, other)
+    assert_identical(dict(plain.gaussians.items()), dict(watched.gaussians.items()))
     steps = recorder.summaries()
     assert set(steps) == {"iteration", *STEPS} and all(len(spans) == 2 for spans in recorder.spans.values())
     for number in range(2):  # with operators for a clock: the steps lie one after the other, and are nearly all of it
@@ -74,15 +72,11 @@ def test_a_resized_model_covers_what_it_did(count):
 
 
 def test_contributions_are_the_set_bits_of_the_walked_masks():
-    # Two tiles of 40 and 5 intersections, one chunk each: buckets of 32, so 2 and 1. The masks of tile t begin at
-    # start // 32 + t.
-    pixels = SimpleNamespace(
-        bucket_counts=torch.tensor([2, 1], dtype=torch.int32),
-        chunks=1,
-        masks=torch.tensor([0b1011, -1, 0b1, 0b11111], dtype=torch.int32),
-    )
+    """Two tiles of 40 and 5 intersections, one chunk each: buckets of 32, so 2 and 1. The masks of tile t begin at
+    start // 32 + t."""
+    counts, masks = torch.tensor([2, 1], dtype=torch.int32), torch.tensor([0b1011, -1, 0b1, 0b11111], dtype=torch.int32)
+    pixels = SimpleNamespace(bucket_counts=counts, chunks=1, masks=masks)
     forward = SimpleNamespace(tile_starts=torch.tensor([0, 40, 45], dtype=torch.int32), pixels=pixels)
-    pixels.masks[2] = 0b1  # tile 1 begins at 40 // 32 + 1 = 2
     counts = floors.count_contributions(SimpleNamespace(_forward=forward))
     assert counts == {"walked": 96, "contributing": 3 + 32 + 1}
 

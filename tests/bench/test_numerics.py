@@ -14,9 +14,7 @@ from helpers.statistics_errors import CASES
 
 @pytest.fixture(scope="module")
 def numerics() -> Iterator[ModuleType]:
-    path = Path(__file__).parents[2] / "docs" / "lab" / "numerics.py"
-    spec = importlib.util.spec_from_file_location("lab_numerics", path)
-    assert spec is not None and spec.loader is not None
+    spec = importlib.util.spec_from_file_location("lab_numerics", Path(__file__).parents[2] / "docs/lab/numerics.py")
     module = importlib.util.module_from_spec(spec)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, spec.name, module)  # where dataclasses look up their types

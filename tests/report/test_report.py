@@ -34,18 +34,16 @@ def test_a_strip_is_photo_render_and_error():
     photo, image = torch.zeros(5, 7, 3), torch.zeros(5, 7, 3)
     image[2, 3] = 1.0
     made = strip(photo, image)
-    assert made.shape == (5, 3 * 7 + 2 * GAP, 3)
-    assert (made[:, 7 : 7 + GAP] == 255).all()
+    assert made.shape == (5, 3 * 7 + 2 * GAP, 3) and (made[:, 7 : 7 + GAP] == 255).all()
     assert made[2, 3].tolist() == [0, 0, 0] and made[2, 7 + GAP + 3].tolist() == [255, 255, 255]
     assert made[2, 2 * (7 + GAP) + 3].sum() > 500 > made[0, 2 * (7 + GAP)].sum()
 
 
 def test_errors_have_the_colours_of_matplotlib():
     errors = torch.linspace(0.0, 1.0, 1001)[None]
-    picture = error_picture(errors[..., None].expand(-1, -1, 3) * ERROR_FULL_SCALE, torch.zeros(1, 1001, 3))
-    expected = (matplotlib.colormaps["inferno"](errors.numpy())[..., :3] * 255.0).round()
-    assert (np.abs(picture.numpy() - expected).max(axis=-1) > 0).mean() < 0.01  # but for the rounding of the scale
-    assert np.abs(picture.numpy() - expected).max() <= 6
+    picture = error_picture(errors[..., None].expand(-1, -1, 3) * ERROR_FULL_SCALE, torch.zeros(1, 1001, 3)).numpy()
+    off = np.abs(picture - (matplotlib.colormaps["inferno"](errors.numpy())[..., :3] * 255.0).round()).max(axis=-1)
+    assert (off > 0).mean() < 0.01 and off.max() <= 6  # but for the rounding of the scale
 
 
 def test_pictures_are_written_in_the_format_of_their_suffix(tmp_path, monkeypatch):
@@ -60,12 +58,11 @@ def test_pictures_are_written_in_the_format_of_their_suffix(tmp_path, monkeypatc
     assert failed.value.filename == str(tmp_path / "full.png"), "which a write does not know"
 
 
-@pytest.mark.parametrize("count", [1, 2, 12])
+@pytest.mark.parametrize("count", [1, 12])
 def test_plots_of_any_length(tmp_path, count):
     values = [20.0 + i for i in range(count)]
     plot_against_seconds(tmp_path / "p.png", list(range(count)), values, "test PSNR in dB", "shop_$5_$9")
-    width, height = Image.open(tmp_path / "p.png").size
-    assert width > 600 and height > 400
+    assert min(Image.open(tmp_path / "p.png").size) > 400
 
 
 def test_the_commit_of_the_sources(tmp_path, monkeypatch):
@@ -133,9 +130,8 @@ def test_lpips_takes_the_weights_of_torchs_cache_and_says_what_is_missing(tmp_pa
     monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", module)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(evaluation, "LPIPS_PACKAGES", ("torch", "no_such_package"))
-    assert evaluation.load_lpips(torch.device("cpu"))[1].startswith(
-        "it needs no_such_package: pip install no_such_package torch=="
-    )
+    _, reason = evaluation.load_lpips(torch.device("cpu"))
+    assert reason.startswith("it needs no_such_package: pip install no_such_package torch==")
     monkeypatch.setattr(evaluation, "LPIPS_PACKAGES", ())
     function, reason = evaluation.load_lpips(torch.device("cpu"))
     assert function is None and "vgg16-397923af.pth" in reason and str(tmp_path) not in reason

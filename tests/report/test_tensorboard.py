@@ -46,12 +46,9 @@ def test_a_run_that_was_lost_and_resumed_has_every_point_once(capture, tmp_path,
     assert (first[:, 50:80] != last[:, 50:80]).any(), "the render changes"
 
 
-def test_nothing_is_written_unless_asked_for(capture):
-    assert event_writers(tiny_config(capture)) == []
-
-
 def test_a_missing_package_is_named_before_anything_is_written(turbogs, capture, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    assert event_writers(tiny_config(capture)) == [], "nothing is written unless asked for"
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *TINY, ASKED)
     assert (code, out) == (2, "") and err.count("\n") == 1, err
     assert 'needs the package tensorboard: pip install "tensorboard>=2.12"' in err
