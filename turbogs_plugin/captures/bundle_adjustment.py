@@ -17,15 +17,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from turbogs_plugin.scene.scene import Observations
 
-ROUNDS, CAMERA_STEPS, POINT_STEPS = 6, 2, 1
-RESECTION_STEPS = 10
+ROUNDS, CAMERA_STEPS, RESECTION_STEPS = 6, 2, 10
 PRIOR = 0.006
 """Standard deviation of every parameter of a camera before any is learnt, in the units of `Pinholes.moved`: four to six
 pixels at the edge of a photo of 1200."""
@@ -46,7 +44,7 @@ DERIVATIVES = (
     ((0, 0, -1), (0, 5, -1), (1, 4, 1), (2, 1, 1), (4, 6, 1), (5, 8, -1), (7, 2, 1)),
 )
 """Derivatives of a pixel's x and y by parameters of `Pinholes.moved` but the principal point: (parameter, function of
-`_Adjustment._camera_sums`, sign), in units of the focal length, and from function 6 on of the depth."""
+`_Adjustment.move_cameras`, sign), in units of the focal length, and from function 6 on of the depth."""
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 """Rows and columns of the entries of a symmetric 3x3 matrix that are computed."""
 
@@ -74,11 +72,6 @@ class Pinholes:
         """Cameras of viewmats [V, 4, 4], intrinsics [V, 3, 3] in pixels, and sizes [V, 2] (width, height)."""
         return cls(viewmats[:, :3, :3], viewmats[:, :3, 3], Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2], 0.5 * sizes[:, 0])
 
-    def where(self, kept: np.ndarray, others: Pinholes) -> Pinholes:
-        """Own cameras where `kept` [V] bool, the others elsewhere."""
-        pairs = ((getattr(self, field.name), getattr(others, field.name)) for field in fields(Pinholes))
-        return Pinholes(*(np.where(kept.reshape(-1, *[1] * (own.ndim - 1)), own, other) for own, other in pairs))
-
     def moved(self, by: np.ndarray, depths: np.ndarray) -> Pinholes:
         """The cameras after a step.
 
@@ -100,10 +93,9 @@ class Pinholes:
 
 @dataclass(frozen=True)
 class Refinement:
-    """Cameras and points that agree better with one another.
+    """Cameras and points [M, 3] that agree better with one another.
 
     Args:
-        cameras, points: of the same photos, and [M, 3].
         spread: [PARAMETERS, PARAMETERS] covariance of how cameras differ from those that were given, in the units of
             `Pinholes.moved`.
         count: how many cameras are others than those that were given.
@@ -138,9 +130,8 @@ def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observa
         for _ in range(CAMERA_STEPS):
             adjustment.move_cameras()
             adjustment.learn_spread()
-        for _ in range(POINT_STEPS):
-            adjustment.move_points()
-    refined, moved = adjustment.agreeing_cameras(), adjustment.points
+        adjustment.move_points()
+    refined, moved = adjustment.agreeing_cameras(), np.ascontiguousarray(adjustment.places.T)
     count = int((refined.focal != cameras.focal).any(axis=1).sum())
     medians = (_median(adjustment.first_errors), _median(reprojection_errors(refined, moved, observations)))
     return Refinement(refined, moved, adjustment.spread, count, *medians)
@@ -149,10 +140,9 @@ def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observa
 def refine_alone(
     cameras: Pinholes, points: np.ndarray, observations: Observations, spread: np.ndarray | None = None
 ) -> Pinholes:
-    """Cameras that agree better with points, which stay.
+    """Cameras that agree better with points, which stay; arguments as in `refine_together`.
 
     Args:
-        cameras, points, observations: as in `refine_together`.
         spread: of a `Refinement` of other photos of the capture; None: `PRIOR` of each parameter.
     """
     adjustment = _Adjustment(cameras, points, observations, spread)
@@ -189,6 +179,7 @@ class _Adjustment:
     Attributes:
         places: [3, M], the points.
         pixels: [2, O], where photos show them.
+        own: V slices, the observations of each view.
         moves: [V, PARAMETERS], how far each camera has come.
         spread: [PARAMETERS, PARAMETERS], the prior's covariance of these.
         doubts: [V, PARAMETERS, PARAMETERS], the covariance of each camera's moves that is left by what the photo shows
@@ -205,25 +196,14 @@ class _Adjustment:
         views = len(cameras.focal)
         self.places, self.pixels = (np.array(rows.T, order="C") for rows in (points, observations.pixels))
         self.point_ids = observations.point_ids
-        self.starts = np.searchsorted(observations.view_ids, np.arange(views + 1))
+        starts = np.searchsorted(observations.view_ids, np.arange(views + 1))
+        self.own, self.counts = [slice(*ends) for ends in itertools.pairwise(starts.tolist())], np.diff(starts)
         self.moves = np.zeros((views, PARAMETERS))
         self.spread = PRIOR**2 * np.eye(PARAMETERS) if spread is None else spread
         self.doubts = np.zeros((views, PARAMETERS, PARAMETERS))
-        sights, _, self.first_errors = self._seen()
-        self.depths = np.array([np.median(part) if len(part) else 1.0 for part in self._by_view(sights[2])])
+        (*_, depths), _, self.first_errors = self._seen()
+        self.depths = np.array([np.median(depths[own]) if own.stop > own.start else 1.0 for own in self.own])
         self.scale = max(_median(self.first_errors), FINEST)
-
-    @property
-    def points(self) -> np.ndarray:
-        """[M, 3]."""
-        return np.ascontiguousarray(self.places.T)
-
-    def _by_view(self, values: np.ndarray) -> list[np.ndarray]:
-        return np.split(values, self.starts[1:-1])
-
-    def _parts(self) -> Iterator[tuple[int, slice]]:
-        """Each view, and the place of its observations among all."""
-        return ((view, slice(*own)) for view, own in enumerate(itertools.pairwise(self.starts.tolist())))
 
     def _seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The observations: x / z, y / z and z in the camera [3, O]; residuals [2, O]; their lengths [O], infinite
@@ -232,7 +212,7 @@ class _Adjustment:
         sights = np.take(self.places, self.point_ids, axis=1)
         residuals = np.empty((2, sights.shape[1]))
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
-            for view, own in self._parts():
+            for view, own in enumerate(self.own):
                 sights[:, own] = cameras.rotations[view] @ sights[:, own] + cameras.translations[view][:, None]
                 sights[:2, own] /= sights[2, own]
                 residuals[:, own] = sights[:2, own] * cameras.focal[view][:, None] + cameras.centers[view][:, None]
@@ -252,11 +232,18 @@ class _Adjustment:
         return sights, residuals, weights
 
     def move_cameras(self) -> None:
-        """One step of every camera."""
-        products, slopes = self._camera_sums()
-        factors, prior = self._camera_factors(), np.linalg.inv(self.spread)  # [V, 2, PARAMETERS, 9]
+        """One step of every camera, by sums over its observations of products of nine functions of the point with each
+        other and with the residuals: 1, p, q, pp, pq, qq, 1 / z, p / z and q / z, where p is x / z and q is y / z."""
+        (p, q, near), residuals, weights = self._counted()
+        roots = np.sqrt(weights)
+        functions = np.stack([np.ones_like(p), p, q, p * p, p * q, q * q, near, near * p, near * q])
+        functions *= roots
+        residuals *= roots
+        products = np.array([functions[:, own] @ functions[:, own].T for own in self.own])  # [V, 9, 9]
+        slopes = np.array([functions[:, own] @ residuals[:, own].T for own in self.own])  # [V, 9, 2]
+        factors, prior = self._camera_factors(), np.linalg.inv(self.spread)
         normals = (factors @ products[:, None] @ factors.swapaxes(2, 3)).sum(axis=1) + prior
-        told = np.diff(self.starts) >= FEWEST_OBSERVATIONS
+        told = self.counts >= FEWEST_OBSERVATIONS
         self.doubts[told] = np.linalg.inv(normals[told])
         right = np.einsum("vcai,vic->va", factors, slopes) - self.moves @ prior  # of the normal equations
         steps = np.einsum("vab,vb->va", self.doubts, right)
@@ -265,27 +252,13 @@ class _Adjustment:
 
     def _camera_factors(self) -> np.ndarray:
         """[V, 2, PARAMETERS, 9]: how x and y of a pixel change by each parameter of its camera, in factors of functions
-        of the point, listed at `_camera_sums`."""
+        of the point, listed at `move_cameras`."""
         factors = np.zeros((len(self.depths), 2, PARAMETERS, 9))
         for axis, (derivatives, focal) in enumerate(zip(DERIVATIVES, self.cameras.focal.T, strict=True)):
             for parameter, function, sign in derivatives:
                 factors[:, axis, parameter, function] = sign * focal * (self.depths if function >= 6 else 1.0)
             factors[:, axis, 8 + axis, 0] = self.cameras.half_widths
         return factors
-
-    def _camera_sums(self) -> tuple[np.ndarray, np.ndarray]:
-        """[V, 9, 9], [V, 9, 2]: of each view, weighted sums of products of nine functions with each other and with the
-        residuals. The functions are 1, p, q, pp, pq, qq, 1 / z, p / z and q / z, where p is x / z and q is y / z."""
-        (p, q, near), residuals, weights = self._counted()
-        roots = np.sqrt(weights)
-        functions = np.stack([np.ones_like(p), p, q, p * p, p * q, q * q, near, near * p, near * q])
-        functions *= roots
-        residuals *= roots
-        products, slopes = np.empty((len(self.depths), 9, 9)), np.empty((len(self.depths), 9, 2))
-        for view, own in self._parts():
-            products[view] = functions[:, own] @ functions[:, own].T
-            slopes[view] = functions[:, own] @ residuals[:, own].T
-        return products, slopes
 
     def learn_spread(self) -> None:
         """One step of expectation-maximisation of the prior."""
@@ -305,9 +278,21 @@ class _Adjustment:
             sums[[0, 3, 5]] += POINT_DAMPING
             self.places += np.where((seen >= 2) & (traces > 0), _solved(*sums), 0.0)
 
+    def _point_entries(self) -> np.ndarray:
+        """[9, O]: what each observation adds to its point's normal equations in the world: six entries of a symmetric
+        matrix and three of a vector."""
+        (p, q, near), (across, down), weights = self._counted()
+        weights *= near
+        across, down = across * weights, down * weights
+        weights *= near
+        functions = np.stack([weights, weights * p, weights * q, weights * p * p, weights * q * q, across, down,
+                              across * p, down * q])  # fmt: skip
+        for own, factors in zip(self.own, self._point_factors(), strict=True):
+            functions[:, own] = factors @ functions[:, own]
+        return functions
+
     def _point_factors(self) -> np.ndarray:
-        """[V, 9, 9]: six of a symmetric matrix and three of a vector, of a point's normal equations in the world, in
-        factors of functions of what a photo shows of it, listed at `_point_entries`."""
+        """[V, 9, 9]: these entries in factors of functions of what a photo shows of the point, listed above."""
         across, down, ahead = self.cameras.rotations.swapaxes(0, 1)  # [V, 3] each
         (fx, fy), (i, j) = self.cameras.focal.T[:, :, None], UPPER
         factors = np.zeros((len(fx), 9, 9))
@@ -319,24 +304,12 @@ class _Adjustment:
             factors[:, 6:, column + 6] = -focal * ahead
         return factors
 
-    def _point_entries(self) -> np.ndarray:
-        """[9, O]: what each observation adds to its point's normal equations."""
-        factors = self._point_factors()
-        (p, q, near), (across, down), weights = self._counted()
-        weights *= near
-        across, down = across * weights, down * weights
-        weights *= near
-        functions = np.stack([weights, weights * p, weights * q, weights * p * p, weights * q * q, across, down,
-                              across * p, down * q])  # fmt: skip
-        for view, own in self._parts():
-            functions[:, own] = factors[view] @ functions[:, own]
-        return functions
-
     def agreeing_cameras(self) -> Pinholes:
         """The cameras; the given one where its photo agrees no better."""
-        pairs = zip(self._by_view(self.first_errors), self._by_view(self._seen()[2]), strict=True)
-        better = np.array([len(new) > 0 and np.median(new) < np.median(old) for old, new in pairs])
-        return self.cameras.where(better, self.given)
+        old, new = self.first_errors, self._seen()[2]
+        better = np.array([own.stop > own.start and np.median(new[own]) < np.median(old[own]) for own in self.own])
+        pairs = ((getattr(self.cameras, field.name), getattr(self.given, field.name)) for field in fields(Pinholes))
+        return Pinholes(*(np.where(better.reshape(-1, *[1] * (now.ndim - 1)), now, then) for now, then in pairs))
 
 
 def _solved(a, b, c, d, e, f, x, y, z) -> np.ndarray:
@@ -349,7 +322,5 @@ def _solved(a, b, c, d, e, f, x, y, z) -> np.ndarray:
 def _rotations(vectors: np.ndarray) -> np.ndarray:
     """[V, 3, 3] of rotation vectors [V, 3] (Rodrigues)."""
     angles = np.linalg.norm(vectors, axis=1)[:, None, None]
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    cross = np.cross(np.eye(3), vectors[:, None])  # `cross @ a` is the cross product with `a`
     return np.eye(3) + np.sinc(angles / np.pi) * cross + 0.5 * np.sinc(angles / (2 * np.pi)) ** 2 * (cross @ cross)

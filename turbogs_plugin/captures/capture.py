@@ -10,15 +10,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from turbogs_plugin.captures.undistort import Lens
+from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.scene import Observations
 
 FEWEST_PHOTOS = 3
 """Fewest photos of a capture."""
-
-LARGEST_SIDE = 65535
-"""Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
 
 LONGEST_NAME = 4096
 """Most letters of a photo's name."""
