@@ -90,9 +90,8 @@ def channels_of(paths: Sequence[Path]) -> int:
         with opened_image(path) as image:
             return is_transparent(image)
 
-    candidates = [path for path in paths if path.suffix.lower() not in OPAQUE_SUFFIXES]
     with decoding_threads() as pool:
-        return 4 if any(pool.map(transparent, candidates)) else 3
+        return 4 if any(pool.map(transparent, (p for p in paths if p.suffix.lower() not in OPAQUE_SUFFIXES))) else 3
 
 
 def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
@@ -108,12 +107,11 @@ def load_photos(
     channels: int = 3,
     progress: Callable[[int, int], object] | None = None,
 ) -> Photos:
-    """Decode photos in parallel, undistorted, then reduced to their target sizes by area averaging.
+    """Decode V photos in parallel, undistorted, then reduced to their target sizes by area averaging.
 
     Photos are taken as stored: an orientation in EXIF is ignored, as COLMAP does.
 
     Args:
-        paths: V files.
         targets: [V, 2] int64 (width, height) to give them.
         lenses: one a photo, None for a pinhole camera.
         channels: 3, where photos that are transparent lose their alpha and keep their colours as stored; or 4, where
@@ -124,15 +122,13 @@ def load_photos(
         InputError: a photo that cannot be decoded (the first one in order is named); more photos than fit in memory or
             on the disk.
     """
-    offsets = pixel_offsets(targets)
-    colors = _room(targets, channels)
+    offsets, colors = pixel_offsets(targets), _room(targets, channels)
     pixels = colors.numpy()
 
     def load(view: int) -> bool:
         """Decode a photo; True where it is opaque."""
-        target = tuple(targets[view].tolist())
+        target, lens = tuple(targets[view].tolist()), lenses[view]
         photo = _decode(paths[view], MODES[channels])
-        lens = lenses[view]
         if lens is not None:
             photo = lens.undistort(photo)
         if photo.size != target:
@@ -175,12 +171,8 @@ def opened_image(
     path: Path, what: str = "photo", remedy: str = "copy it there again", pixels: int = ALWAYS_PIXELS
 ) -> Iterator[Image.Image]:
     """The file with its header read, as stored; `InputError` for whatever goes wrong with it while entered, for more
-    pixels than its bytes may have, and for a TIFF that Pillow would turn, as it turns no other kind: cameras are by the
-    pixels as they are stored.
-
-    Args:
-        pixels: number that the image may have whatever the file's bytes.
-    """
+    pixels than its bytes may have (`pixels` are allowed whatever they are), and for a TIFF that Pillow would turn, as
+    it turns no other kind: cameras are by the pixels as they are stored."""
     other = OTHER_FORMATS.get(path.suffix.lower())
     try:
         with Image.open(path, formats=(*FORMATS, other) if other else FORMATS) as image:
@@ -201,16 +193,8 @@ def opened_image(
     except Exception as error:  # a broken file can raise anything in its decoder
         reason = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
         if isinstance(error, UnidentifiedImageError):
-            reason, remedy = _what_it_is(path, remedy)
+            start = path.read_bytes()[:64]
+            known = (said for form, *said in KINDS if re.match(form, start, re.DOTALL | re.IGNORECASE))
+            kind, remedy = next(known, ["no image of a known kind", remedy])
+            reason = f"it is {kind}" if start else "the file is empty"
         raise InputError(f"cannot read the {what} {path}: {reason}; {remedy}") from error
-
-
-def _what_it_is(path: Path, remedy: str) -> tuple[str, str]:
-    """What a file is that Pillow does not know, by its first bytes, and what to do; `remedy` where nothing is known."""
-    with path.open("rb") as file:
-        start = file.read(64)
-    if not start:
-        return "the file is empty", remedy
-    known = (said for form, *said in KINDS if re.match(form, start, re.DOTALL | re.IGNORECASE))
-    kind, advice = next(known, ["no image of a known kind", remedy])
-    return f"it is {kind}", advice

@@ -43,22 +43,17 @@ PHOTO_NAME = "view_{:03d}.png"
 
 @dataclass
 class Solid:
-    """A solid on the vertical axis of its own coordinates, placed by a turn about it and a translation.
+    """A solid on the vertical axis of its own coordinates, placed by a turn about it in radians and a translation [3].
 
     In own coordinates, `intersect` gives distances [R] along rays from `origin` [3] in `directions` [R, 3], infinite
-    where they miss it, and `normal` outward unit normals [R, 3] at surface points.
-
-    Args:
-        size: radius, or of a box half of each side [3].
-        texture: colours of surface points.
-        position: [3].
-        turn: radians.
+    where they miss it, and `normal` outward unit normals [R, 3] at surface points. `size`: radius, or half of each side
+    of a box [3].
     """
 
     size: float | np.ndarray
     texture: Texture
     position: np.ndarray
-    turn: float = 0.0
+    turn: float
 
     @property
     def rotation(self) -> np.ndarray:
@@ -146,15 +141,13 @@ def cast(
     solids: list[Sphere | Box | Disc], origin: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """[R, 3] colours and [R] distances of what rays see; black at infinity where they see nothing."""
-    nearest = np.full(len(directions), np.inf, dtype=np.float32)
-    owner = np.full(len(directions), -1)
-    for number, solid in enumerate(solids):
-        distances = solid.intersect((origin - solid.position) @ solid.rotation, directions @ solid.rotation)
-        closer = distances < nearest
-        nearest[closer], owner[closer] = distances[closer], number
+    hits = [
+        solid.intersect((origin - solid.position) @ solid.rotation, directions @ solid.rotation) for solid in solids
+    ]
+    nearest, owner = np.min(hits, axis=0).astype(np.float32), np.argmin(hits, axis=0)
     colors = np.zeros((len(directions), 3), dtype=np.float32)
     for number, solid in enumerate(solids):
-        rays = np.flatnonzero(owner == number)
+        rays = np.flatnonzero((owner == number) & np.isfinite(nearest))
         points = (origin + nearest[rays, None] * directions[rays] - solid.position) @ solid.rotation
         light = np.maximum(solid.normal(points) @ solid.rotation.T @ LIGHT, 0.0)
         colors[rays] = solid.texture(points) * (AMBIENT + (1.0 - AMBIENT) * light)[:, None]
@@ -163,9 +156,8 @@ def cast(
 
 def orbit_pose(angle: float) -> np.ndarray:
     """[3, 4] float64 world to camera, on a ring about the table that swings in height."""
-    center = np.array(
-        [ORBIT_RADIUS * np.cos(angle), ORBIT_RADIUS * np.sin(angle), ORBIT_HEIGHT + ORBIT_SWING * np.sin(3 * angle)]
-    )
+    height = ORBIT_HEIGHT + ORBIT_SWING * np.sin(3 * angle)
+    center = np.array([ORBIT_RADIUS * np.cos(angle), ORBIT_RADIUS * np.sin(angle), height])
     return look_at(center, target=np.array([0.0, 0.0, LOOK_AT]), up=np.array([0.0, 0.0, 1.0]))[:3]
 
 
@@ -187,14 +179,13 @@ def write_demo_capture(path: str | Path, seed: int = 0, views: int = 32, width: 
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".") as temporary:
         capture = Path(temporary) / "capture"
-        model = capture / "sparse" / "0"
-        (capture / "images").mkdir(parents=True)
-        model.mkdir(parents=True)
+        for folder in ("images", "sparse/0"):
+            (capture / folder).mkdir(parents=True)
         random = np.random.default_rng(seed)
         poses = np.stack([orbit_pose(2 * np.pi * view / views) for view in range(views)])  # [V, 3, 4]
         seen = _photograph(capture / "images", random, poses, width, height)
         _fill(reconstruction, poses, *seen, FOCAL * width, random)
-        write_whole(reconstruction, model, target)
+        write_whole(reconstruction, capture / "sparse/0", target)
         capture.rename(target)
     return target
 
@@ -240,13 +231,8 @@ def _fill(
     focal: float,
     random: np.random.Generator,
 ) -> None:
-    """Make an empty reconstruction what COLMAP would have made of the photos.
-
-    Args:
-        poses: [V, 3, 4] world to camera.
-        points, colors, depths: as `_photograph` returns them.
-        focal: pixels.
-    """
+    """Make an empty reconstruction what COLMAP would have made of the photos of cameras `poses` [V, 3, 4]; points,
+    colours and depths as `_photograph` returns them, focal length in pixels."""
     views, height, width = depths.shape
     local = np.einsum("vij,mj->vmi", poses[:, :, :3], points) + poses[:, None, :, 3]  # [V, M, 3]
     pixels = local[..., :2] / local[..., 2:] * focal + [width / 2, height / 2]  # [V, M, 2]

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 from turbogs_plugin.captures import llff, transforms
@@ -90,11 +91,11 @@ def _elsewhere(folder: Path) -> str:
 
 def other_poses(folder: Path) -> str:
     """A line on a file of another program's cameras in a folder, or in the one that its ``images`` are of; or empty."""
-    places = (folder, folder.absolute().parent) if folder.absolute().name == IMAGES else (folder,)
-    patterns = [(source, form) for source, forms in OTHER_POSES.items() for form in forms]
-    globs = ((place.glob(at + form), source) for place in places for at in ("", "*/") for source, form in patterns)
-    files = ((file, source) for found, source in globs for file in found)
-    return next((f"{file} is not read, which may have cameras of {source}" for file, source in files), "")
+    for place in (folder, folder.absolute().parent) if folder.absolute().name == IMAGES else (folder,):
+        for at, (source, forms) in product(("", "*/"), OTHER_POSES.items()):
+            for file in (file for form in forms for file in place.glob(at + form)):
+                return f"{file} is not read, which may have cameras of {source}"
+    return ""
 
 
 def _no_capture(scene: Path) -> InputError:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture
 from turbogs_plugin.captures.decoding import ALWAYS_PIXELS, channels_of, load_photos, photo_sizes, reduced_sizes
@@ -82,7 +81,13 @@ def load_scene(
         capture = capture.subset(np.flatnonzero(~test), np.arange(len(capture.points)), (note,))
         capture = replace(capture, test=None)
         test = _test_views(scene, capture, test_every)
-    frame, viewmats, points = _normalised(scene, capture, test)
+    with np.errstate(over="ignore", invalid="ignore"):
+        frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
+    points = torch.from_numpy(frame.normalise_points(capture.points)).float()  # [M, 3]
+    if (far := ~(points.abs() < FARTHEST).all(dim=1)).any():
+        raise InputError(
+            f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32: take them out"
+        )
     files = _find_photos(scene, capture, factor)
     mask_files, mask_note = find_masks(scene, capture, files.paths)
     masks = load_masks(mask_files, files.paths, capture, files.file_sizes, files.sizes)
@@ -94,15 +99,15 @@ def load_scene(
                 f"{scene}: all {part.sum()} {name} photos are masked whole: zero in a mask, or in "
                 "the alpha of a photo, is masked; mend the masks, or take them away"
             )
-    train, tested = (
-        _posed(capture, viewmats, files.sizes, masks, views, photos)
-        for views, photos in zip(parts, _load_parts(capture, files, parts, progress), strict=True)
-    )
-    if capture.point_colors is None:
-        point_colors = colors_in_photos(points, train.cameras, train.photos, train.masks)
-    else:
-        point_colors = torch.from_numpy(capture.point_colors)
+    views, count = np.concatenate(parts), len(parts[0])
+    paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
+    channels = channels_of(paths) if capture.alpha == "opacity" else 3
+    photos = load_photos(paths, files.sizes[views], lenses, channels, progress)  # in one array: its room is found once
+    first = int(photos.offsets[count])
+    train = _posed(capture, frame, files, masks, parts[0], Photos(photos.colors[:first], photos.sizes[:count]))
+    tested = _posed(capture, frame, files, masks, parts[1], Photos(photos.colors[first:], photos.sizes[count:]))
     notes = (
+        *capture.notes,
         files.note,
         undistortion_note(capture.lenses),
         mask_note,
@@ -110,53 +115,40 @@ def load_scene(
         "transparent photos are composited on a background (train.background)" if train.photos.transparent else "",
         file_note([train.photos.stored, tested.photos.stored], "photos"),
     )
+    given = capture.point_colors
+    shown = train.cameras, train.photos, train.masks
     return Scene(
         name=scene.resolve().name,
         train=train,
         test=tested,
         points=points,
-        point_colors=point_colors,
+        point_colors=colors_in_photos(points, *shown) if given is None else torch.from_numpy(given),
         frame=frame,
         extent=1.0,
-        drawn_points=capture.point_colors is None,
+        drawn_points=given is None,
         doubt=capture.doubt,
-        notes=tuple(filter(None, (*capture.notes, *notes))),
+        notes=tuple(filter(None, notes)),
     )
-
-
-def _load_parts(
-    capture: Capture, files: PhotoFiles, parts: list[np.ndarray], progress: Callable[[int, int], object] | None
-) -> list[Photos]:
-    """The photos of the training views and of the test views, `parts`, in one array: its room is found at once."""
-    views = np.concatenate(parts)
-    paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
-    channels = channels_of(paths) if capture.alpha == "opacity" else 3
-    photos = load_photos(paths, files.sizes[views], lenses, channels, progress)
-    count = len(parts[0])
-    first = int(photos.offsets[count])
-    return [
-        Photos(photos.colors[:first], photos.sizes[:count]),
-        Photos(photos.colors[first:], photos.sizes[count:]),
-    ]
 
 
 def _posed(
     capture: Capture,
-    viewmats: Tensor,
-    sizes: np.ndarray,
+    frame: Frame,
+    files: PhotoFiles,
     masks: list[PixelMasks | None],
     views: np.ndarray,
     photos: Photos,
 ) -> PosedImages:
-    """Some views with their photos, cameras for photos of these `sizes` [V, 2], masks and what the photos show."""
-    ratios = sizes / capture.sizes  # [V, 2]
-    intrinsics = capture.Ks.copy()
+    """Some views with their photos, cameras for photos of these sizes, masks and what the photos show."""
+    ratios = files.sizes[views] / capture.sizes[views]
+    intrinsics = capture.Ks[views]
     intrinsics[:, :2] *= ratios[:, :, None]
-    cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
-    shown = None if capture.observations is None else capture.observations.of_views(views, ratios[views])
+    viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats[views])).float()
+    cameras = Cameras(viewmats, torch.from_numpy(intrinsics).float(), files.sizes[views])
+    shown = None if capture.observations is None else capture.observations.of_views(views, ratios)
     own, masked = [masks[view] for view in views], None
     if any(mask is not None for mask in own):
-        pairs = zip(own, sizes[views, ::-1].tolist(), strict=True)  # (height, width)
+        pairs = zip(own, files.sizes[views, ::-1].tolist(), strict=True)  # (height, width)
         masked = PixelMasks.joined([mask or PixelMasks.of(np.ones(size, dtype=bool)) for mask, size in pairs])
     return PosedImages(cameras, tuple(capture.names[view] for view in views), photos, masked, shown)
 
@@ -184,67 +176,47 @@ def _test_views(scene: Path, capture: Capture, test_every: int) -> np.ndarray:
     return test
 
 
-def _normalised(scene: Path, capture: Capture, test: np.ndarray) -> tuple[Frame, Tensor, Tensor]:
-    """The normalised frame about the training cameras; in it, float32 poses [V, 4, 4] and points [M, 3]."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
-    viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats)).float()
-    points = torch.from_numpy(frame.normalise_points(capture.points)).float()
-    far = ~(points.abs() < FARTHEST).all(dim=1)
-    if far.any():
-        raise InputError(
-            f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32: take them out"
-        )
-    return frame, viewmats, points
-
-
 def _masked_note(names: tuple[str, ...], masks: list[PixelMasks | None], sizes: np.ndarray, seen: np.ndarray) -> str:
     """One line on masked pixels and on views left out for them; empty where nothing is masked."""
     pixels = {view: int(mask.pixel_counts[0]) for view, mask in enumerate(masks) if mask is not None}
     if not pixels:
         return ""
     share = 1.0 - sum(pixels.values()) / int(sizes[list(pixels)].prod(axis=1).sum())
-    gone = [name for name, kept in zip(names, seen, strict=True) if not kept]
-    left_out = f"; {len(gone)} masked whole are left out: {gone[0]}, ..." if gone else ""
+    left_out = f"; {(~seen).sum()} masked whole are left out: {names[seen.argmin()]}, ..." if not seen.all() else ""
     return f"{len(pixels)} photos have masked pixels, {share:.1%} of them{left_out}"
 
 
 def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
     """The files to read where photos are to be reduced by `factor`: copies in ``images_<factor>`` where all are there
     in the right size, else the capture's photos. Photos of ``images_4`` that are smaller than their cameras by that are
-    reduced already."""
-    if (copies := _reduced_copies(scene, capture, factor)) is not None:
-        return copies
+    reduced already.
+
+    Raises:
+        InputError: a photo that is too small for its lens, or no scaled copy of one of its camera's size.
+    """
+    expected, bent = capture.photo_sizes, np.array([lens is not None for lens in capture.lenses])
+    copies = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
+    paths = [copies / name for name in capture.names]
+    # Photos of lenses are undistorted in full size.
+    if factor > 1 and capture.photo_folder != scene and not bent.any() and all(map(Path.is_file, paths)):
+        sizes = photo_sizes(paths)
+        if (np.abs(sizes - expected / factor) <= 1.0).all():
+            return PhotoFiles(paths, sizes, sizes)
     paths = [capture.photo_folder / name for name in capture.names]
     sizes = photo_sizes(paths)
-    note = _require_scaled(paths, sizes, capture.photo_sizes)
-    grown = capture.photo_sizes.prod(axis=1) > np.maximum(ALWAYS_PIXELS, LENS_PIXELS * sizes.prod(axis=1))
-    if bent := [view for view in np.flatnonzero(grown) if capture.lenses[view] is not None]:
-        (width, height), camera = sizes[bent[0]].tolist(), "x".join(map(str, capture.photo_sizes[bent[0]].tolist()))
+    note = _require_scaled(paths, sizes, expected)
+    grown = bent & (expected.prod(axis=1) > np.maximum(ALWAYS_PIXELS, LENS_PIXELS * sizes.prod(axis=1)))
+    if grown.any():
+        size, camera = ("x".join(map(str, both[grown.argmax()].tolist())) for both in (sizes, expected))
         raise InputError(
-            f"photo {paths[bent[0]]} is {width}x{height}, too small to be undistorted by a camera of {camera}: use the "
+            f"photo {paths[grown.argmax()]} is {size}, too small to be undistorted by a camera of {camera}: use the "
             "photos that the cameras were reconstructed from"
         )
     reduction = re.fullmatch(rf"{IMAGES}_(\d+)", capture.photo_folder.name)
-    smaller = capture.photo_sizes[0, 0] > 1.5 * sizes[0, 0]
-    already = int(reduction[1]) if reduction and smaller else 1
+    already = int(reduction[1]) if reduction and expected[0, 0] > 1.5 * sizes[0, 0] else 1
     pairs = zip(capture.lenses, sizes.tolist(), strict=True)
     undistorted = np.array([size if lens is None else lens.size_of(size) for lens, size in pairs], dtype=np.int64)
-    targets = reduced_sizes(undistorted, max(1.0, factor / already))
-    return PhotoFiles(paths, sizes, targets, note)
-
-
-def _reduced_copies(scene: Path, capture: Capture, factor: int) -> PhotoFiles | None:
-    """The copies in the folder beside the photos; None where one is missing or of another size, or is to be
-    undistorted, which is done in full size."""
-    folder = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
-    paths = [folder / name for name in capture.names]
-    if factor == 1 or capture.photo_folder == scene or any(capture.lenses) or not all(map(Path.is_file, paths)):
-        return None
-    sizes = photo_sizes(paths)
-    if (np.abs(sizes - capture.photo_sizes / factor) > 1.0).any():
-        return None
-    return PhotoFiles(paths, sizes, sizes)
+    return PhotoFiles(paths, sizes, reduced_sizes(undistorted, max(1.0, factor / already)), note)
 
 
 def _require_scaled(paths: list[Path], sizes: np.ndarray, expected: np.ndarray) -> str:
