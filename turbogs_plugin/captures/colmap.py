@@ -14,7 +14,7 @@ import numpy as np
 
 from turbogs_plugin.captures import colmap_files
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, named, require_printable, text_of
-from turbogs_plugin.captures.colmap_files import CLOUD, FILES, ColmapModel, ModelImage, read_model, read_poses
+from turbogs_plugin.captures.colmap_files import CLOUD, FILES, ColmapModel, ModelImage, read_model
 from turbogs_plugin.captures.photo_files import IMAGES, find_named
 from turbogs_plugin.captures.starting_points import clouds_beside
 from turbogs_plugin.captures.undistort import Lens, lens_of_camera
@@ -69,10 +69,8 @@ def _models_in(place: Path, needed: Sequence[str]) -> list[tuple[Path, str]]:
 
 
 def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
-    """Read a reconstruction. Its photos are found by `find_named`; images whose photo does not exist are left out.
-
-    Args:
-        folder, suffix: as `find_model` gives them.
+    """Read a reconstruction, that `find_model` has found. Its photos are found by `find_named`; images whose photo does
+    not exist are left out.
 
     Raises:
         InputError: files that are damaged or inconsistent, a camera that no pinhole can take the place of, or fewer
@@ -84,18 +82,17 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     images = [model.images[place] for place in found.places]
     ids = {image.camera for image in images}
     lenses = {id: lens_of_camera(model.cameras[id], f"camera {id} of {folder}") for id in ids}
-    poses, doubt = read_poses(folder, suffix, model)
     pairs = [(model.cameras[image.camera], lenses[image.camera]) for image in images]
     Ks = [camera.calibration_matrix() if lens is None else lens.K for camera, lens in pairs]
     sizes = [(camera.width, camera.height) if lens is None else lens.size for camera, lens in pairs]
     where = "" if found.folder == scene / IMAGES else f", photos in {found.folder}"
-    kind = {".bin": "binary", ".txt": "text"}[suffix]
+    kind = "binary" if suffix == ".bin" else "text"
     cloud = folder / CLOUD if len(model.points) and model.points["id"][0] >= colmap_files.FIRST_OF_CLOUD else None
     test, split = _own_split(scene, folder, found.names)
     return Capture(
         names=found.names,
         photo_folder=found.folder,
-        viewmats=np.array([poses[image.number] for image in images]).reshape(-1, 4, 4),
+        viewmats=np.array([image.viewmat for image in images]).reshape(-1, 4, 4),
         Ks=np.array(Ks).reshape(-1, 3, 3),
         sizes=np.array(sizes, dtype=np.int64).reshape(-1, 2),
         points=model.points["xyz"].copy(),
@@ -107,11 +104,11 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
             *_choice_note(folder),
             *found.notes,
             *clouds_beside([folder, scene], cloud, f"{CLOUD} is, in a model without points3D"),
-            *([doubt] if doubt else []),
+            *filter(None, [model.doubt]),
         ),
         test=test,
         alpha="mask",
-        doubt=doubt,
+        doubt=model.doubt,
         observations=_observations(model, images, lenses) if len(model.points) else None,
     ).checked(folder)
 
@@ -155,11 +152,8 @@ def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict
 
 
 def read_reconstruction(folder: Path, suffix: str) -> pycolmap.Reconstruction:
-    """The reconstruction as pycolmap reads it, with whole names.
-
-    Raises:
-        InputError: pycolmap cannot read it, or a name cannot be printed.
-    """
+    """The reconstruction as pycolmap reads it, with whole names. Raises `InputError` where it cannot, or where a name
+    cannot be printed."""
     reconstruction = load_pycolmap().Reconstruction()
     try:
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(folder)
@@ -174,10 +168,7 @@ def read_reconstruction(folder: Path, suffix: str) -> pycolmap.Reconstruction:
 
 def write_whole(reconstruction: pycolmap.Reconstruction, folder: Path, called: Path) -> None:
     """Write the binary files of a reconstruction, and see that they are whole: of a full disk pycolmap says nothing.
-
-    Raises:
-        InputError: the files are not whole; `called` is the folder's name in the line.
-    """
+    Raises `InputError` where they are not; `called` is the folder's name in its line."""
     try:
         reconstruction.write_binary(folder)
         read_model(folder, ".bin")

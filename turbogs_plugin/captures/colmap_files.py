@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 import struct
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,35 +38,36 @@ SENSORS = {"CAMERA": 0, "IMU": 1}
 """Kinds of sensors of a rig."""
 NUMBER = re.compile(r"[-+.\de]+|[-+]?(nan|inf)", re.IGNORECASE)
 NAME = re.compile(r"\s*(?:\S+\s+){8}\S+[ \t](.+)")
-"""The line of an image in text: its name is what follows nine numbers, with its spaces."""
+"""The line of an image in text: nine numbers and its name."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class ModelImage:
     """A photo of a reconstruction.
 
     Args:
-        number: COLMAP's identifier.
-        camera: identifier of its camera.
+        number, camera: COLMAP's identifiers.
         name: as the file has it, below the folder of the photos.
-        pose: [7] float64, world to camera: quaternion wxyz of any length, translation. `read_poses` has the frames'.
+        viewmat: [4, 4] float64, world to camera; NaN where the numbers are no pose.
         features: [n] of `FEATURE`.
     """
 
     number: int
     camera: int
     name: str
-    pose: np.ndarray
+    viewmat: np.ndarray
     features: np.ndarray
 
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A reconstruction: cameras by their identifiers, images in the file's order, points [M] of `POINT` by theirs."""
+    """A reconstruction: cameras by their identifiers, images in the file's order, points [M] of `POINT` by theirs; and
+    a line where images' own poses are not those of their frames."""
 
     cameras: dict[int, pycolmap.Camera]
     images: list[ModelImage]
     points: np.ndarray
+    doubt: str
 
 
 def read_model(folder: Path, suffix: str) -> ColmapModel:
@@ -83,30 +83,28 @@ def read_model(folder: Path, suffix: str) -> ColmapModel:
             f"{folder} has no {' and no '.join(absent)}: bring back what is missing, or take that folder away and find "
             "the cameras by 'turbogs reconstruct'"
         )
-    known = _read_points(points)
-    model = ColmapModel(_read_cameras(cameras), _read_images(images), known[np.argsort(known["id"], kind="stable")])
-    for image in model.images:
-        if image.camera not in model.cameras:
-            trouble = f"image {image.number} has camera {image.camera}, which {cameras.name} does not have"
-            raise _damaged(images, trouble)
-    if twice := [number for number, times in Counter(image.number for image in model.images).items() if times > 1]:
-        raise _damaged(images, f"two images have the number {twice[0]}")
-    return model
+    known_cameras, known_points = _read_cameras(cameras), _read_points(points)
+    known_images: dict[int, ModelImage] = {}
+    for record in _records(images):
+        number, *pose, camera = record.take("I7dI")
+        if number in known_images:
+            raise _damaged(images, f"two images have the number {number}")
+        if camera not in known_cameras:
+            raise _damaged(images, f"image {number} has camera {camera}, which {cameras.name} does not have")
+        name, features = record.name(), record.features()
+        known_images[number] = ModelImage(number, camera, name, _viewmat(np.array(pose)), features)
+    doubt = _take_poses_of_frames(known_images, folder / f"rigs{suffix}", folder / f"frames{suffix}")
+    order = np.argsort(known_points["id"], kind="stable")
+    return ColmapModel(known_cameras, [*known_images.values()], known_points[order], doubt)
 
 
-def read_poses(folder: Path, suffix: str, model: ColmapModel) -> tuple[dict[int, np.ndarray], str]:
-    """[4, 4] float64 world to camera of each image, by its identifier; NaN where the numbers are no pose. And a line
-    where an image's own pose is another than its frame's.
-
-    A pose is by the image's frame and its camera's place in the rig, where ``rigs`` and ``frames`` are both there and
-    have the image (COLMAP 3.12 and later); else the image's own. Raises `InputError` where they are damaged.
-    """
-    own = {image.number: _viewmat(image.pose) for image in model.images}
-    rigs, frames = folder / f"rigs{suffix}", folder / f"frames{suffix}"
+def _take_poses_of_frames(images: dict[int, ModelImage], rigs: Path, frames: Path) -> str:
+    """Give images, by their identifiers, the pose of their frame and their camera's place in the rig, where both files
+    are there and have the image (COLMAP 3.12 and later). A line where an image's own pose is another; or empty."""
     if not (rigs.is_file() and frames.is_file()):
         alone = next((file.name for file in (rigs, frames) if file.is_file()), "")
-        return own, f"{alone} is not used: of rigs{suffix} and frames{suffix} one is missing" if alone else ""
-    poses = dict(own)
+        return f"{alone} is not used: of {rigs.name} and {frames.name} one is missing" if alone else ""
+    others = 0
     in_rig: dict[int, dict[tuple[int, int], np.ndarray]] = {}  # of each rig, its sensors' places but the first one's
     for record in _records(rigs):
         rig, count = record.take("II")
@@ -121,12 +119,15 @@ def read_poses(folder: Path, suffix: str, model: ColmapModel) -> tuple[dict[int,
             raise _damaged(frames, f"frame {frame} has rig {rig}, which {rigs.name} does not have")
         from_world = _viewmat(np.array(pose))
         for kind, sensor, image in (record.take("iIQ") for _ in range(count)):
-            if image in poses and kind == SENSORS["CAMERA"]:
+            if image in images and kind == SENSORS["CAMERA"]:
                 place = in_rig[rig].get((kind, sensor))
-                poses[image] = from_world if place is None else place @ from_world
-    others = sum(not np.allclose(own[image], pose, 1e-4, 1e-3, equal_nan=True) for image, pose in poses.items())
+                viewmat = from_world if place is None else place @ from_world
+                others += not np.allclose(images[image].viewmat, viewmat, 1e-4, 1e-3, equal_nan=True)
+                images[image].viewmat = viewmat
+    if not others:
+        return ""
     remedy = f"take {frames.name} away if a program moved the images alone"
-    return poses, f"poses are of {frames.name}, and {others} of images{suffix} are others: {remedy}" if others else ""
+    return f"poses are of {frames.name}, and {others} of images{frames.suffix} are others: {remedy}"
 
 
 def _viewmat(pose: np.ndarray) -> np.ndarray:
@@ -189,7 +190,7 @@ class _Text:
             raise self._damaged(f"has {left[:40]!r} after its last number")
 
     def name(self) -> str:
-        """The rest of an image's line. It need not be UTF-8."""
+        """The rest of an image's line, with its spaces. It need not be UTF-8."""
         if named := NAME.fullmatch(self.lines[self.number - 1].rstrip()):
             return named[1]
         raise self._damaged("ends where a name should follow")
@@ -243,7 +244,7 @@ class _Binary:
         return struct.unpack_from(f"<{layout}", self.data, self.skip(struct.calcsize(f"<{layout}")))
 
     def end(self) -> None:
-        """The next record follows."""
+        pass  # the next record follows
 
     def name(self) -> str:
         length = self.data.find(b"\0", self.position) - self.position
@@ -278,14 +279,6 @@ def _read_cameras(path: Path) -> dict[int, pycolmap.Camera]:
         record.end()
         cameras[number] = camera
     return cameras
-
-
-def _read_images(path: Path) -> list[ModelImage]:
-    images = []
-    for record in _records(path):
-        number, *pose, camera = record.take("I7dI")
-        images.append(ModelImage(number, camera, record.name(), np.array(pose), record.features()))
-    return images
 
 
 def _read_points(path: Path) -> np.ndarray:

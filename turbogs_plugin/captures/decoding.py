@@ -193,7 +193,8 @@ def opened_image(
     except Exception as error:  # a broken file can raise anything in its decoder
         reason = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
         if isinstance(error, UnidentifiedImageError):
-            start = path.read_bytes()[:64]
+            with path.open("rb") as file:
+                start = file.read(64)
             known = (said for form, *said in KINDS if re.match(form, start, re.DOTALL | re.IGNORECASE))
             kind, remedy = next(known, ["no image of a known kind", remedy])
             reason = f"it is {kind}" if start else "the file is empty"
