@@ -51,21 +51,13 @@ UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 
 @dataclass(frozen=True)
 class Pinholes:
-    """V cameras in float64.
+    """V cameras in float64."""
 
-    Args:
-        rotations: [V, 3, 3], world to camera.
-        translations: [V, 3].
-        focal: [V, 2], pixels.
-        centers: [V, 2], principal points, pixels.
-        half_widths: [V], pixels.
-    """
-
-    rotations: np.ndarray
-    translations: np.ndarray
-    focal: np.ndarray
-    centers: np.ndarray
-    half_widths: np.ndarray
+    rotations: np.ndarray  # [V, 3, 3], world to camera
+    translations: np.ndarray  # [V, 3]
+    focal: np.ndarray  # [V, 2], pixels
+    centers: np.ndarray  # [V, 2], principal points, pixels
+    half_widths: np.ndarray  # [V], pixels
 
     @classmethod
     def of(cls, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> Pinholes:
@@ -118,13 +110,7 @@ class Refinement:
 
 
 def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observations) -> Refinement:
-    """Cameras and points that agree better with one another.
-
-    Args:
-        cameras: as they were given.
-        points: [M, 3] float64.
-        observations: of these points by these cameras.
-    """
+    """Cameras and points [M, 3] float64 that agree better with one another, by observations of the points."""
     adjustment = _Adjustment(cameras, points, observations)
     for _ in range(ROUNDS):
         for _ in range(CAMERA_STEPS):
@@ -140,11 +126,8 @@ def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observa
 def refine_alone(
     cameras: Pinholes, points: np.ndarray, observations: Observations, spread: np.ndarray | None = None
 ) -> Pinholes:
-    """Cameras that agree better with points, which stay; arguments as in `refine_together`.
-
-    Args:
-        spread: of a `Refinement` of other photos of the capture; None: `PRIOR` of each parameter.
-    """
+    """Cameras that agree better with points, which stay. `spread`: of a `Refinement` of other photos of the capture;
+    None: `PRIOR` of each parameter."""
     adjustment = _Adjustment(cameras, points, observations, spread)
     for _ in range(RESECTION_STEPS):
         adjustment.move_cameras()

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.captures.bundle_adjustment import Pinholes, of_these_photos, refine_alone, refine_together
-from turbogs_plugin.scene.scene import Observations, PosedImages, Scene
+from turbogs_plugin.scene.scene import Scene
 from turbogs_plugin.types import Cameras
 
 
@@ -39,22 +38,23 @@ class RefinedCameras:
 
 def find_cameras(scene: Scene, training: bool = True) -> RefinedCameras | None:
     """Cameras that agree better with where photos show the scene's points; None where the capture does not say that, or
-    it does not fit.
+    says it of other photos.
 
     Args:
         training: False: training cameras and points stay, and only the test photos get cameras beside theirs.
     """
     places = scene.points.double().numpy()
-    shown, tested = (_usable(views, places) for views in (scene.train, scene.test))
-    if shown is None or tested is None:
+    given, tested = _pinholes(scene.train.cameras), _pinholes(scene.test.cameras)
+    shown, seen = scene.train.observations, scene.test.observations
+    if not (shown and seen and of_these_photos(given, places, shown) and of_these_photos(tested, places, seen)):
         return None
-    together = refine_together(_pinholes(scene.train.cameras), places, shown)
+    together = refine_together(given, places, shown)
     train, points, error = scene.train.cameras, scene.points, together.before
     notes: tuple[str, ...] = ()
     if training and together.count:
         places, error, notes = together.points, together.after, (together.text("training cameras"),)
         train, points = _cameras(together.cameras, train), torch.from_numpy(places).float()
-    beside = refine_alone(_pinholes(scene.test.cameras), places, tested, together.spread)
+    beside = refine_alone(tested, places, seen, together.spread)
     return RefinedCameras(train, points, _cameras(beside, scene.test.cameras), error, notes)
 
 
@@ -77,18 +77,9 @@ def refine_cameras(scene: Scene, training: bool = True) -> Scene:
     return with_cameras(scene, find_cameras(scene, training))
 
 
-def _usable(views: PosedImages, points: np.ndarray) -> Observations | None:
-    """Observations of the views; None where there are none, or they belong to other photos."""
-    observations = views.observations
-    if observations is None or not len(observations):
-        return None
-    return observations if of_these_photos(_pinholes(views.cameras), points, observations) else None
-
-
 def _pinholes(cameras: Cameras) -> Pinholes:
     """Cameras as float64 arrays."""
-    viewmats, Ks = (matrices.cpu().double().numpy() for matrices in (cameras.viewmats, cameras.Ks))
-    return Pinholes.of(viewmats, Ks, cameras.sizes)
+    return Pinholes.of(cameras.viewmats.cpu().double().numpy(), cameras.Ks.cpu().double().numpy(), cameras.sizes)
 
 
 def _cameras(pinholes: Pinholes, like: Cameras) -> Cameras:

@@ -50,11 +50,8 @@ MOST_THREADS = 16
 
 
 def reduced_sizes(sizes: np.ndarray, factor: float) -> np.ndarray:
-    """[V, 2] int64: sizes divided by `factor`, to the nearest pixel.
-
-    Raises:
-        InputError: the factor leaves a side of less than `SMALLEST_SIDE`.
-    """
+    """[V, 2] int64: sizes divided by `factor`, to the nearest pixel. Raises `InputError` where the factor leaves a side
+    of less than `SMALLEST_SIDE`."""
     reduced = np.floor(sizes / factor + 0.5).astype(np.int64)
     if factor > 1 and reduced.min() < SMALLEST_SIDE:
         width, height = sizes[sizes.min(axis=1).argmin()].tolist()
@@ -122,7 +119,13 @@ def load_photos(
         InputError: a photo that cannot be decoded (the first one in order is named); more photos than fit in memory or
             on the disk.
     """
-    offsets, colors = pixel_offsets(targets), _room(targets, channels)
+    offsets = pixel_offsets(targets)
+
+    def room(channels: int) -> Tensor:
+        """[X, channels] uint8, with any content."""
+        return host_array((int(offsets[-1]), channels), torch.uint8, f"{len(targets)} photos")
+
+    colors = room(channels)
     pixels = colors.numpy()
 
     def load(view: int) -> bool:
@@ -144,13 +147,8 @@ def load_photos(
             if progress is not None:
                 progress(count, len(paths))
     if opaque and channels == 4:
-        colors = _room(targets, 3).copy_(colors[:, :3])
+        colors = room(3).copy_(colors[:, :3])
     return Photos(colors, targets)
-
-
-def _room(sizes: np.ndarray, channels: int) -> Tensor:
-    """[X, channels] uint8 for photos of these `sizes` [V, 2], with any content."""
-    return host_array((int(pixel_offsets(sizes)[-1]), channels), torch.uint8, f"{len(sizes)} photos")
 
 
 def decoding_threads() -> ThreadPoolExecutor:

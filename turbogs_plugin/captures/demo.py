@@ -182,12 +182,9 @@ def _photographed(folder: Path, seed: int, views: int, width: int, height: int) 
     random, side, focal = np.random.default_rng(seed), RAYS_PER_SIDE, FOCAL * width
     angles, poses = 2 * np.pi * np.arange(views) / views, np.empty((views, 3, 4))
     for view, angle in enumerate(angles):
-        at = [
-            ORBIT_RADIUS * np.cos(angle),
-            ORBIT_RADIUS * np.sin(angle),
-            ORBIT_HEIGHT + ORBIT_SWING * np.sin(3 * angle),
-        ]
-        poses[view] = look_at(np.array(at), target=np.array([0.0, 0.0, LOOK_AT]), up=np.array([0.0, 0.0, 1.0]))[:3]
+        ring = ORBIT_RADIUS * np.array([np.cos(angle), np.sin(angle)])
+        at = np.array([*ring, ORBIT_HEIGHT + ORBIT_SWING * np.sin(3 * angle)])
+        poses[view] = look_at(at, target=np.array([0.0, 0.0, LOOK_AT]), up=np.array([0.0, 0.0, 1.0]))[:3]
     solids = demo_solids(random)
     x, y = np.meshgrid((np.arange(width * side) + 0.5) / side, (np.arange(height * side) + 0.5) / side)
     rays = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)], axis=-1)

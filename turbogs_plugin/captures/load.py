@@ -51,14 +51,13 @@ def load_scene(
 ) -> Scene:
     """Load a capture with its photos.
 
-    Cameras with distortion become pinhole cameras in the same place, their photos are undistorted. Masks are read from
-    where `find_masks` looks, and from the photos' alpha where that is no opacity (`Capture.alpha`); views that are
-    masked whole are left out.
+    Cameras with distortion become pinhole cameras in the same place, their photos are undistorted. Views that are
+    masked whole (`find_masks`, or by the photos' alpha where `Capture.alpha` says so) are left out.
 
     Args:
         path: the scene's folder. Where it could be of several kinds, the first of these is taken: a COLMAP
-            reconstruction (binary or text, in ``sparse``, ``colmap/sparse``, ... or numbered folders of these), a
-            ``transforms.json``, NeRF-synthetic's ``transforms_train.json``, LLFF's ``poses_bounds.npy``.
+            reconstruction (`find_model`), ``transforms.json``, NeRF-synthetic's ``transforms_train.json``, LLFF's
+            ``poses_bounds.npy``.
         factor: photos and intrinsics are reduced by this. Copies in ``images_<factor>`` are used where all are there
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
@@ -104,8 +103,8 @@ def load_scene(
     channels = channels_of(paths) if capture.alpha == "opacity" else 3
     photos = load_photos(paths, files.sizes[views], lenses, channels, progress)  # in one array: its room is found once
     first = int(photos.offsets[count])
-    train = _posed(capture, frame, files, masks, parts[0], Photos(photos.colors[:first], photos.sizes[:count]))
-    tested = _posed(capture, frame, files, masks, parts[1], Photos(photos.colors[first:], photos.sizes[count:]))
+    train = _posed(capture, frame, masks, parts[0], Photos(photos.colors[:first], photos.sizes[:count]))
+    tested = _posed(capture, frame, masks, parts[1], Photos(photos.colors[first:], photos.sizes[count:]))
     notes = (
         *capture.notes,
         files.note,
@@ -132,23 +131,18 @@ def load_scene(
 
 
 def _posed(
-    capture: Capture,
-    frame: Frame,
-    files: PhotoFiles,
-    masks: list[PixelMasks | None],
-    views: np.ndarray,
-    photos: Photos,
+    capture: Capture, frame: Frame, masks: list[PixelMasks | None], views: np.ndarray, photos: Photos
 ) -> PosedImages:
     """Some views with their photos, cameras for photos of these sizes, masks and what the photos show."""
-    ratios = files.sizes[views] / capture.sizes[views]
+    ratios = photos.sizes / capture.sizes[views]
     intrinsics = capture.Ks[views]
     intrinsics[:, :2] *= ratios[:, :, None]
     viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats[views])).float()
-    cameras = Cameras(viewmats, torch.from_numpy(intrinsics).float(), files.sizes[views])
+    cameras = Cameras(viewmats, torch.from_numpy(intrinsics).float(), photos.sizes)
     shown = None if capture.observations is None else capture.observations.of_views(views, ratios)
     own, masked = [masks[view] for view in views], None
     if any(mask is not None for mask in own):
-        pairs = zip(own, files.sizes[views, ::-1].tolist(), strict=True)  # (height, width)
+        pairs = zip(own, photos.sizes[:, ::-1].tolist(), strict=True)  # (height, width)
         masked = PixelMasks.joined([mask or PixelMasks.of(np.ones(size, dtype=bool)) for mask, size in pairs])
     return PosedImages(cameras, tuple(capture.names[view] for view in views), photos, masked, shown)
 

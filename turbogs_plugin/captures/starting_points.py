@@ -96,11 +96,9 @@ def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> 
 
 
 def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
-    """Nearest and farthest depth that cameras at `centers` [V, 3] can tell from others, as a guess.
-
-    The extent is the median distance from the mean. Along a path, what is seen is nearer than that: the nearest depth
-    is the geometric mean of extent and spacing, at most half the extent.
-    """
+    """Nearest and farthest depth that cameras at `centers` [V, 3] can tell from others, as a guess: ten times the
+    extent, the median distance from the mean. Along a path, what is seen is nearer than that: the nearest depth is the
+    geometric mean of extent and spacing, at most half the extent."""
     mean = centers[0] + (centers - centers[0]).mean(axis=0)
     extent = float(np.median(np.linalg.norm(centers - mean, axis=1)))
     if extent <= 1e-12 * np.abs(centers).max():  # all in one place but for rounding
@@ -135,15 +133,11 @@ def points_in_views(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, bou
 
 
 def colors_in_photos(points: Tensor, cameras: Cameras, photos: Photos, masks: PixelMasks | None = None) -> Tensor:
-    """[M, 3] uint8: for each point the mean colour of the pixels at which photos see it, hidden or not.
+    """[M, 3] uint8: for each point [M, 3] float32 the mean colour of the pixels at which at most `COLOR_VIEWS` photos,
+    evenly spread, see it, hidden or not.
 
-    Masked pixels do not count, and transparent ones by their alpha. Points that none sees get the mean of the others;
-    grey where there is none.
-
-    Args:
-        points: [M, 3] float32.
-        cameras, photos: of V views in the same coordinates, of which at most `COLOR_VIEWS`, evenly spread, are used.
-        masks: which pixels count, on the CPU; None for all.
+    Masked pixels (`masks`, on the CPU) do not count, and transparent ones by their alpha. Points that none sees get the
+    mean of the others; grey where there is none.
     """
     cameras, points = cameras.to("cpu", torch.float32), points.cpu()
     sums, counts = torch.zeros(len(points), 3), torch.zeros(len(points), 1)

@@ -51,30 +51,24 @@ def read_transforms(scene: Path) -> Capture:
         InputError: a file that is not such JSON, lacks something or describes no lens; a photo that two frames name;
             lists that are no split; a cloud that is absent or damaged.
     """
-    source = scene / FILE
-    content, frames = _frames(source)
-    words, test = "", None
-    if (split := _own_split(content, frames, source)) is not None:
-        train, test = split
-        used = [frame for frame in frames if _written(frame) in train | test]
-        words = f", {len(frames) - len(used)} others not used" if len(used) < len(frames) else ""
-        frames = used
+    content, frames = _frames(source := scene / FILE)
+    train, test = _own_split(content, [_written(frame) for frame in frames], source)
+    used = [frame for frame in frames if _written(frame) in train | test]
+    words = f", {len(frames) - len(used)} others not used" if len(used) < len(frames) else ""
     if content.get(TEST_FRAMES):
         tested = _frames(source, TEST_FRAMES)[1]
-        frames, test = [*frames, *tested], {*(test or ()), *map(_written, tested)}
-        words += f", with {TEST_FRAMES}"
-    return _capture(scene, source, content, frames, test or (), f"nerfstudio, instant-ngp{words}")
+        used, test, words = [*used, *tested], {*test, *map(_written, tested)}, f"{words}, with {TEST_FRAMES}"
+    return _capture(scene, source, content, used, test, f"nerfstudio, instant-ngp{words}")
 
 
 def read_blender(scene: Path) -> Capture:
     """Read a NeRF-synthetic capture, with the split of its files; where there are no test photos, the split is left to
     the order of the photos. Raises `InputError` as `read_transforms`, and for one photo in both files."""
-    source = scene / TRAIN_FILE
-    content, train = _frames(source)
+    content, train = _frames(source := scene / TRAIN_FILE)
     test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
-    tested = [] if test_file is None else _frames(test_file)[1]
-    words = f"NeRF-synthetic{f', with {test_file.name}' if test_file else ''}"
-    return _capture(scene, source, content, [*train, *tested], {_written(frame) for frame in tested}, words)
+    tested, words = ([], "") if test_file is None else (_frames(test_file)[1], f", with {test_file.name}")
+    test = {_written(frame) for frame in tested}
+    return _capture(scene, source, content, [*train, *tested], test, f"NeRF-synthetic{words}")
 
 
 def read_frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -109,7 +103,7 @@ def _capture(
 
     Args:
         content: of the file; its ``ply_file_path`` has the points.
-        test: written names of the test photos; where none of them exists: no own split.
+        test: written names of the test photos; where none of them exists, there is no own split.
         words: on the kind of capture.
     """
     names, cloud = [_written(frame) for frame in frames], content.get("ply_file_path")
@@ -153,17 +147,17 @@ def _capture(
     ).checked(source)
 
 
-def _own_split(content: dict[str, Any], frames: list[Frame], source: Path) -> tuple[set[str], set[str]] | None:
-    """Written names of the training and of the test photos, by the lists of a ``transforms.json``; None without any.
+def _own_split(content: dict[str, Any], written: list[str], source: Path) -> tuple[set[str], set[str]]:
+    """Written names of the training and of the test photos, by the lists of a ``transforms.json``; no test photos
+    without any list.
 
     Test photos are in ``test_filenames``; where that is absent or empty, in ``val_filenames``. Where both are, all
     photos that are not for training are tests. Without ``train_filenames``, what is in no other list trains. Raises
     `InputError` for lists that are no split.
     """
-    lists = {key: content[key] for key in LISTS if content.get(key)}
+    lists, everything = {key: content[key] for key in LISTS if content.get(key)}, set(written)
     if not lists:
-        return None
-    everything = {_written(frame) for frame in frames}
+        return everything, set()
     if all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists.values()):
         listed = {key: {PureWindowsPath(name).as_posix() for name in names} for key, names in lists.items()}
         test, validation = listed.get(TEST, set()), listed.get(VALIDATION, set())
@@ -236,12 +230,8 @@ def _read_camera(values: Frame, photo: Path, source: Path) -> tuple[np.ndarray, 
 
 
 def pinhole(values: dict, source: Path, size: tuple[float, float]) -> np.ndarray | None:
-    """[3, 3] float64 intrinsics of one frame; None where nothing gives its horizontal focal length.
-
-    Args:
-        values: the frame's own, before the file's for all frames.
-        size: (width, height), in whose middle the principal point is unless it is given.
-    """
+    """[3, 3] float64 intrinsics of one frame; None where nothing gives its horizontal focal length. The principal point
+    is in the middle of the `size` (width, height) unless it is given."""
     focals: list[float | None] = []
     for axis, side in zip("xy", size, strict=True):
         focal = number_of(values, source, f"fl_{axis}")
@@ -257,11 +247,8 @@ def pinhole(values: dict, source: Path, size: tuple[float, float]) -> np.ndarray
 
 def opengl_viewmat(matrix: Any, owner: str) -> np.ndarray:
     """[4, 4] float64 world to camera, of a camera-to-world matrix in OpenGL's axes; its numbers may be in one row, and
-    the matrix be transposed, where its last column says so.
-
-    Raises:
-        InputError: it is no matrix of 4x4 finite numbers, or no rotation and translation; `owner` names it.
-    """
+    the matrix be transposed, where its last column says so. Raises `InputError` where it is no matrix of 4x4 finite
+    numbers, or no rotation and translation; `owner` names it."""
     try:
         pose = np.array(matrix, dtype=np.float64)
     except (ValueError, TypeError, OverflowError):

@@ -37,22 +37,12 @@ EDGE = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A camera with distortion and the pinhole camera that takes its place.
-
-    Args:
-        camera: as it is.
-        size: (width, height) of the pinhole's images.
-        K: [3, 3] float64, intrinsics of the pinhole.
-    """
+    """A camera with distortion, and the pinhole camera that takes its place: (width, height) of its images, and its
+    intrinsics [3, 3] float64."""
 
     camera: pycolmap.Camera
     size: tuple[int, int]
     K: np.ndarray
-
-    @property
-    def model(self) -> str:
-        """Name of the camera model, as COLMAP has it."""
-        return self.camera.model.name
 
     @property
     def photo_size(self) -> tuple[int, int]:
@@ -85,12 +75,9 @@ def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
     """The lens of a camera of any of COLMAP's models; None for a pinhole, and for an impossible size, which
     `Capture.checked` refuses.
 
-    Args:
-        owner: names the camera in messages.
-
     Raises:
         InputError: parameters that are not those of a lens within the photo; a panorama, which no pinhole camera can
-            show.
+            show; `owner` names the camera.
     """
     model, size = camera.model.name, (camera.width, camera.height)
     bent = model not in STRAIGHT_MODELS or camera.params[list(camera.extra_params_idxs())].any()
@@ -155,4 +142,4 @@ def undistortion_note(lenses: Sequence[Lens | None]) -> str:
     first, others = bent[0], len(set(map(id, bent))) - 1
     photo, image = ("x".join(map(str, size)) for size in (first.photo_size, first.size))
     more = f", and {others} more cameras" if others else ""
-    return f"{len(bent)} photos undistorted: {first.model} {photo} -> PINHOLE {image}{more}"
+    return f"{len(bent)} photos undistorted: {first.camera.model.name} {photo} -> PINHOLE {image}{more}"
