@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,8 +49,7 @@ UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 """Rows and columns of the entries of a symmetric 3x3 matrix that are computed."""
 
 
-@dataclass(frozen=True)
-class Pinholes:
+class Pinholes(NamedTuple):
     """V cameras in float64."""
 
     rotations: np.ndarray  # [V, 3, 3], world to camera
@@ -74,31 +73,18 @@ class Pinholes:
         """
         turns = _rotations(by[:, :3])
         translations = np.einsum("vij,vj->vi", turns, self.translations) + by[:, 3:6] * depths[:, None]
-        return replace(
-            self,
-            rotations=turns @ self.rotations,
-            translations=translations,
-            focal=self.focal * (1.0 + by[:, 6:8]),
-            centers=self.centers + by[:, 8:] * self.half_widths[:, None],
-        )
+        focal, centers = self.focal * (1.0 + by[:, 6:8]), self.centers + by[:, 8:] * self.half_widths[:, None]
+        return Pinholes(turns @ self.rotations, translations, focal, centers, self.half_widths)
 
 
-@dataclass(frozen=True)
-class Refinement:
-    """Cameras and points [M, 3] that agree better with one another.
-
-    Args:
-        spread: [PARAMETERS, PARAMETERS] covariance of how cameras differ from those that were given, in the units of
-            `Pinholes.moved`.
-        count: how many cameras are others than those that were given.
-        before, after: medians of `reprojection_errors`, in pixels.
-    """
+class Refinement(NamedTuple):
+    """Cameras and points that agree better with one another."""
 
     cameras: Pinholes
-    points: np.ndarray
-    spread: np.ndarray
-    count: int
-    before: float
+    points: np.ndarray  # [M, 3]
+    spread: np.ndarray  # [PARAMETERS, PARAMETERS], covariance of how far cameras have moved (`Pinholes.moved`)
+    count: int  # of cameras that are others than those that were given
+    before: float  # median of `reprojection_errors`, pixels
     after: float
 
     def text(self, called: str) -> str:
@@ -157,20 +143,7 @@ def of_these_photos(cameras: Pinholes, points: np.ndarray, observations: Observa
 
 class _Adjustment:
     """Cameras and points on their way. What observations have is coordinate by coordinate, [2, O] or [3, O]: a row is
-    read and written in one go.
-
-    Attributes:
-        places: [3, M], the points.
-        pixels: [2, O], where photos show them.
-        own: V slices, the observations of each view.
-        moves: [V, PARAMETERS], how far each camera has come.
-        spread: [PARAMETERS, PARAMETERS], the prior's covariance of these.
-        doubts: [V, PARAMETERS, PARAMETERS], the covariance of each camera's moves that is left by what the photo shows
-            and the prior; zero where the photo shows too little to be refined.
-        depths: [V], medians of the points before each camera.
-        first_errors: [O] pixels, before the first step.
-        scale: pixels, the median of these: errors far above it count little.
-    """
+    read and written in one go."""
 
     def __init__(
         self, cameras: Pinholes, points: np.ndarray, observations: Observations, spread: np.ndarray | None = None
@@ -181,12 +154,13 @@ class _Adjustment:
         self.point_ids = observations.point_ids
         starts = np.searchsorted(observations.view_ids, np.arange(views + 1))
         self.own, self.counts = [slice(*ends) for ends in itertools.pairwise(starts.tolist())], np.diff(starts)
-        self.moves = np.zeros((views, PARAMETERS))
-        self.spread = PRIOR**2 * np.eye(PARAMETERS) if spread is None else spread
+        self.moves = np.zeros((views, PARAMETERS))  # how far each camera has come
+        self.spread = PRIOR**2 * np.eye(PARAMETERS) if spread is None else spread  # covariance of these in the prior
+        # Covariance of each camera's moves by what its photo shows and the prior; 0 where it shows too little.
         self.doubts = np.zeros((views, PARAMETERS, PARAMETERS))
         (*_, depths), _, self.first_errors = self._seen()
         self.depths = np.array([np.median(depths[own]) if own.stop > own.start else 1.0 for own in self.own])
-        self.scale = max(_median(self.first_errors), FINEST)
+        self.scale = max(_median(self.first_errors), FINEST)  # pixels; errors far above it count little
 
     def _seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The observations: x / z, y / z and z in the camera [3, O]; residuals [2, O]; their lengths [O], infinite
@@ -291,7 +265,7 @@ class _Adjustment:
         """The cameras; the given one where its photo agrees no better."""
         old, new = self.first_errors, self._seen()[2]
         better = np.array([own.stop > own.start and np.median(new[own]) < np.median(old[own]) for own in self.own])
-        pairs = ((getattr(self.cameras, field.name), getattr(self.given, field.name)) for field in fields(Pinholes))
+        pairs = zip(self.cameras, self.given, strict=True)
         return Pinholes(*(np.where(better.reshape(-1, *[1] * (now.ndim - 1)), now, then) for now, then in pairs))
 
 

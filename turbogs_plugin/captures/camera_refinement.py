@@ -7,7 +7,8 @@ the points that training starts from, however that is set: errors by these are o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,32 +18,20 @@ from turbogs_plugin.scene.scene import Scene
 from turbogs_plugin.types import Cameras
 
 
-@dataclass(frozen=True)
-class RefinedCameras:
-    """Cameras and points of a scene by where its photos show its points.
+class RefinedCameras(NamedTuple):
+    """Cameras and points of a scene by where its photos show its points."""
 
-    Args:
-        train: cameras to train with.
-        points: [M, 3] float32, to start from.
-        test: cameras of the test photos beside theirs.
-        reprojection_error: of the training cameras, as `Scene` has it.
-        notes: on what was refined.
-    """
-
-    train: Cameras
-    points: Tensor
-    test: Cameras
-    reprojection_error: float
+    train: Cameras  # to train with
+    points: Tensor  # [M, 3] float32, to start from
+    test: Cameras  # of the test photos beside theirs
+    reprojection_error: float  # of the training cameras, as `Scene` has it
     notes: tuple[str, ...]
 
 
 def find_cameras(scene: Scene, training: bool = True) -> RefinedCameras | None:
     """Cameras that agree better with where photos show the scene's points; None where the capture does not say that, or
-    says it of other photos.
-
-    Args:
-        training: False: training cameras and points stay, and only the test photos get cameras beside theirs.
-    """
+    says it of other photos. Without `training`, training cameras and points stay, and only the test photos get cameras
+    beside theirs."""
     places = scene.points.double().numpy()
     given, tested = _pinholes(scene.train.cameras), _pinholes(scene.test.cameras)
     shown, seen = scene.train.observations, scene.test.observations

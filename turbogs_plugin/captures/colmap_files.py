@@ -12,7 +12,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -43,31 +43,22 @@ NAME = re.compile(r"\s*(?:\S+\s+){8}\S+[ \t](.+)")
 
 @dataclass
 class ModelImage:
-    """A photo of a reconstruction.
+    """A photo of a reconstruction."""
 
-    Args:
-        number, camera: COLMAP's identifiers.
-        name: as the file has it, below the folder of the photos.
-        viewmat: [4, 4] float64, world to camera; NaN where the numbers are no pose.
-        features: [n] of `FEATURE`.
-    """
-
-    number: int
+    number: int  # COLMAP's identifiers, its own and the camera's
     camera: int
-    name: str
-    viewmat: np.ndarray
-    features: np.ndarray
+    name: str  # as the file has it, below the folder of the photos
+    viewmat: np.ndarray  # [4, 4] float64, world to camera; NaN where the numbers are no pose
+    features: np.ndarray  # [n] of `FEATURE`
 
 
-@dataclass(frozen=True)
-class ColmapModel:
-    """A reconstruction: cameras by their identifiers, images in the file's order, points [M] of `POINT` by theirs; and
-    a line where images' own poses are not those of their frames."""
+class ColmapModel(NamedTuple):
+    """A reconstruction."""
 
-    cameras: dict[int, pycolmap.Camera]
-    images: list[ModelImage]
-    points: np.ndarray
-    doubt: str
+    cameras: dict[int, pycolmap.Camera]  # by their identifiers
+    images: list[ModelImage]  # in the file's order
+    points: np.ndarray  # [M] of `POINT`, by their identifiers
+    doubt: str  # a line where images' own poses are not those of their frames
 
 
 def read_model(folder: Path, suffix: str) -> ColmapModel:

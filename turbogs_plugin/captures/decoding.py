@@ -83,12 +83,14 @@ def is_transparent(image: Image.Image) -> bool:
 def channels_of(paths: Sequence[Path]) -> int:
     """4 where a photo may be transparent, by the headers, else 3."""
 
-    def transparent(path: Path) -> bool:
+    def channels(path: Path) -> int:
+        if path.suffix.lower() in OPAQUE_SUFFIXES:
+            return 3
         with opened_image(path) as image:
-            return is_transparent(image)
+            return 4 if is_transparent(image) else 3
 
     with decoding_threads() as pool:
-        return 4 if any(pool.map(transparent, (p for p in paths if p.suffix.lower() not in OPAQUE_SUFFIXES))) else 3
+        return max(pool.map(channels, paths))
 
 
 def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
@@ -130,8 +132,7 @@ def load_photos(
 
     def load(view: int) -> bool:
         """Decode a photo; True where it is opaque."""
-        target, lens = tuple(targets[view].tolist()), lenses[view]
-        photo = _decode(paths[view], MODES[channels])
+        target, lens, photo = tuple(targets[view].tolist()), lenses[view], _decode(paths[view], MODES[channels])
         if lens is not None:
             photo = lens.undistort(photo)
         if photo.size != target:

@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -31,15 +30,6 @@ LENS_PIXELS = 16
 """Pixels of a lens's camera for each of the photo that is undistorted in the camera's size, at most."""
 FARTHEST = 1e15
 """Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
-
-
-class PhotoFiles(NamedTuple):
-    """The files that V photos are read from, and a note on photos of another size than their cameras."""
-
-    paths: list[Path]
-    file_sizes: np.ndarray  # [V, 2] int64 (width, height)
-    sizes: np.ndarray  # [V, 2] int64 to give them, undistorted and reduced
-    note: str = ""
 
 
 def load_scene(
@@ -87,9 +77,9 @@ def load_scene(
         raise InputError(
             f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32: take them out"
         )
-    files = _find_photos(scene, capture, factor)
-    mask_files, mask_note = find_masks(scene, capture, files.paths)
-    masks = load_masks(mask_files, files.paths, capture, files.file_sizes, files.sizes)
+    files, file_sizes, sizes, size_note = _find_photos(scene, capture, factor)
+    mask_files, mask_note = find_masks(scene, capture, files)
+    masks = load_masks(mask_files, files, capture, file_sizes, sizes)
     seen = np.array([mask is None or mask.pixel_counts[0] > 0 for mask in masks])
     parts = [np.flatnonzero(part & seen) for part in (~test, test)]
     for name, part, views in zip(("training", "test"), (~test, test), parts, strict=True):
@@ -99,18 +89,18 @@ def load_scene(
                 "the alpha of a photo, is masked; mend the masks, or take them away"
             )
     views, count = np.concatenate(parts), len(parts[0])
-    paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
+    paths, lenses = ([of_view[view] for view in views] for of_view in (files, capture.lenses))
     channels = channels_of(paths) if capture.alpha == "opacity" else 3
-    photos = load_photos(paths, files.sizes[views], lenses, channels, progress)  # in one array: its room is found once
+    photos = load_photos(paths, sizes[views], lenses, channels, progress)  # in one array: its room is found once
     first = int(photos.offsets[count])
     train = _posed(capture, frame, masks, parts[0], Photos(photos.colors[:first], photos.sizes[:count]))
     tested = _posed(capture, frame, masks, parts[1], Photos(photos.colors[first:], photos.sizes[count:]))
     notes = (
         *capture.notes,
-        files.note,
+        size_note,
         undistortion_note(capture.lenses),
         mask_note,
-        _masked_note(capture.names, masks, files.sizes, seen),
+        _masked_note(capture.names, masks, sizes, seen),
         "transparent photos are composited on a background (train.background)" if train.photos.transparent else "",
         file_note([train.photos.stored, tested.photos.stored], "photos"),
     )
@@ -180,53 +170,42 @@ def _masked_note(names: tuple[str, ...], masks: list[PixelMasks | None], sizes: 
     return f"{len(pixels)} photos have masked pixels, {share:.1%} of them{left_out}"
 
 
-def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
-    """The files to read where photos are to be reduced by `factor`: copies in ``images_<factor>`` where all are there
-    in the right size, else the capture's photos. Photos of ``images_4`` that are smaller than their cameras by that are
-    reduced already.
+def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path], np.ndarray, np.ndarray, str]:
+    """The files of V photos, reduced by `factor`: copies in ``images_<factor>`` where all are there in the right size,
+    else the capture's photos. Photos of ``images_4`` that are smaller than their cameras by that are reduced already.
+
+    Returns:
+        Paths; [V, 2] int64 (width, height) of the files; [V, 2] int64 to give them, undistorted and reduced; a note on
+        photos of another size than their cameras.
 
     Raises:
-        InputError: a photo that is too small for its lens, or no scaled copy of one of its camera's size.
+        InputError: a photo that is too small for its lens; or no scaled copy, to a pixel, of one of its camera's size.
     """
-    expected, bent = capture.photo_sizes, np.array([lens is not None for lens in capture.lenses])
+    cameras, bent = capture.photo_sizes, np.array([lens is not None for lens in capture.lenses])
     copies = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
     paths = [copies / name for name in capture.names]
     # Photos of lenses are undistorted in full size.
     if factor > 1 and capture.photo_folder != scene and not bent.any() and all(map(Path.is_file, paths)):
         sizes = photo_sizes(paths)
-        if (np.abs(sizes - expected / factor) <= 1.0).all():
-            return PhotoFiles(paths, sizes, sizes)
+        if (np.abs(sizes - cameras / factor) <= 1.0).all():
+            return paths, sizes, sizes, ""
     paths = [capture.photo_folder / name for name in capture.names]
-    sizes = photo_sizes(paths)
-    note = _require_scaled(paths, sizes, expected)
-    grown = bent & (expected.prod(axis=1) > np.maximum(ALWAYS_PIXELS, LENS_PIXELS * sizes.prod(axis=1)))
-    if grown.any():
-        size, camera = ("x".join(map(str, both[grown.argmax()].tolist())) for both in (sizes, expected))
-        raise InputError(
-            f"photo {paths[grown.argmax()]} is {size}, too small to be undistorted by a camera of {camera}: use the "
-            "photos that the cameras were reconstructed from"
-        )
+    sizes, note = photo_sizes(paths), ""
+    other = (np.abs(cameras * (sizes / cameras)[:, ::-1] - sizes) > 1.0).all(axis=1)
+    small = bent & (cameras.prod(axis=1) > np.maximum(ALWAYS_PIXELS, LENS_PIXELS * sizes.prod(axis=1)))
+    for wrong in (other, small, (sizes != cameras).any(axis=1)):
+        if not wrong.any():
+            continue
+        path, remedy = paths[wrong.argmax()], "use the photos that the cameras were reconstructed from"
+        size, camera = ("x".join(map(str, both[wrong.argmax()].tolist())) for both in (sizes, cameras))
+        if wrong is other:
+            cause = "it was cropped or turned (an EXIF orientation is not followed), not scaled"
+            raise InputError(f"photo {path} is {size} but its camera is {camera}: {cause}; {remedy}")
+        if wrong is small:
+            raise InputError(f"photo {path} is {size}, too small to be undistorted by a camera of {camera}: {remedy}")
+        note = f"{wrong.sum()} photos in another size than their cameras: intrinsics rescaled from {camera} to {size}"
     reduction = re.fullmatch(rf"{IMAGES}_(\d+)", capture.photo_folder.name)
-    already = int(reduction[1]) if reduction and expected[0, 0] > 1.5 * sizes[0, 0] else 1
+    already = int(reduction[1]) if reduction and cameras[0, 0] > 1.5 * sizes[0, 0] else 1
     pairs = zip(capture.lenses, sizes.tolist(), strict=True)
     undistorted = np.array([size if lens is None else lens.size_of(size) for lens, size in pairs], dtype=np.int64)
-    return PhotoFiles(paths, sizes, reduced_sizes(undistorted, max(1.0, factor / already)), note)
-
-
-def _require_scaled(paths: list[Path], sizes: np.ndarray, expected: np.ndarray) -> str:
-    """A note on the photos that are not of their cameras' size; empty where all are.
-
-    Raises:
-        InputError: a photo that is no scaled copy, to a pixel, of one of its camera's size: it was cropped or turned.
-    """
-    scaled = (np.abs(expected * (sizes / expected)[:, ::-1] - sizes) <= 1.0).any(axis=1)
-    others = np.flatnonzero(~scaled if not scaled.all() else (sizes != expected).any(axis=1))
-    if not len(others):
-        return ""
-    size, camera = ("x".join(map(str, both[others[0]].tolist())) for both in (sizes, expected))
-    if not scaled.all():
-        raise InputError(
-            f"photo {paths[others[0]]} is {size} but its camera is {camera}: it was cropped or turned (an EXIF "
-            "orientation is not followed), not scaled; use the photos that the cameras were reconstructed from"
-        )
-    return f"{len(others)} photos in another size than their cameras: intrinsics rescaled from {camera} to {size}"
+    return paths, sizes, reduced_sizes(undistorted, max(1.0, factor / already)), note
