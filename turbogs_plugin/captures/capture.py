@@ -14,10 +14,8 @@ from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.scene import Observations
 
-FEWEST_PHOTOS = 3
-"""Fewest photos of a capture."""
-LONGEST_NAME = 4096
-"""Most letters of a photo's name."""
+FEWEST_PHOTOS = 3  # fewest photos of a capture
+LONGEST_NAME = 4096  # most letters of a photo's name
 LARGEST_PIXEL = 1e9
 """Most pixels of a focal length or a principal point, and the reciprocal of the fewest: training uses float32."""
 
@@ -30,7 +28,7 @@ class Capture:
         names: V distinct names, ascending.
         photo_folder: photos of full size are ``photo_folder / name``; copies reduced by a factor may lie beside it, in
             a folder of the same name with ``_2``, ``_4``, ... appended.
-        viewmats: [V, 4, 4] float64, world to camera (x right, y down, z forward).
+        viewmats: [V, 4, 4] float64, world to camera (x right, y down, z forward); NaN where that is no rotation.
         Ks: [V, 3, 3] float64, intrinsics of the full-size photos, undistorted where they have a lens.
         sizes: [V, 2] int64 (width, height) of the full-size photos, undistorted where they have a lens.
         points: [M, 3] float64; M is 0 where `load_scene` is to draw them.
@@ -79,11 +77,7 @@ class Capture:
         """
         if not self.names:
             raise InputError(f"{source} has no images with a pose: reconstruct the capture again")
-        turns = self.viewmats[:, :3, :3]
-        with np.errstate(invalid="ignore"):
-            posed = np.isfinite(self.viewmats).all(axis=(1, 2))
-            posed &= np.abs(turns @ turns.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2)) < 1e-3
-            posed &= np.linalg.det(np.nan_to_num(turns)) > 0
+        posed = np.isfinite(self.viewmats).all(axis=(1, 2))
         lensed = (np.abs(self.Ks) < LARGEST_PIXEL).all(axis=(1, 2))
         lensed &= (self.Ks[:, [0, 1], [0, 1]] > 1.0 / LARGEST_PIXEL).all(axis=1)
         sized = ((self.sizes >= 1) & (self.sizes <= LARGEST_SIDE)).all(axis=1)

@@ -136,8 +136,8 @@ def _choice_note(model: Path) -> list[str]:
 
 
 def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict[int, Lens | None]) -> Observations:
-    """Places where images, the views, show points, in pixels of their pinhole cameras. Features whose point is not
-    there are left out. `lenses`: by the cameras' identifiers, None for a pinhole."""
+    """Places where images, the views, show points that are there, in pixels of their pinhole cameras. `lenses`: by the
+    cameras' identifiers, None for a pinhole."""
     ids = model.points["id"]
     parts = [(np.zeros((0, 2)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
     for view, image in enumerate(images):

@@ -27,15 +27,13 @@ if TYPE_CHECKING:
 FILES, SUFFIXES = ("cameras", "images", "points3D"), (".bin", ".txt")
 CLOUD = "points3D.ply"
 """A cloud that stands for the points where a model has none of COLMAP's (InstantSplat)."""
-FIRST_OF_CLOUD = np.uint64(2**63)
-"""First identifier of its points, which no feature names."""
+FIRST_OF_CLOUD = np.uint64(2**63)  # first identifier of its points, which no feature names
 FEATURE = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
 """A place in an image, and the identifier of the point that it shows, or `NO_POINT`."""
 POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3)])
 """A point. In a file its error (float64) and its track follow: a uint64 count, and 8 bytes for each element."""
 NO_POINT = np.uint64(2**64 - 1)
-SENSORS = {"CAMERA": 0, "IMU": 1}
-"""Kinds of sensors of a rig."""
+SENSORS = {"CAMERA": 0, "IMU": 1}  # kinds of sensors of a rig
 NUMBER = re.compile(r"[-+.\de]+|[-+]?(nan|inf)", re.IGNORECASE)
 NAME = re.compile(r"\s*(?:\S+\s+){8}\S+[ \t](.+)")
 """The line of an image in text: nine numbers and its name."""

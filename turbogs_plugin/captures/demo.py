@@ -30,10 +30,8 @@ RAYS_PER_SIDE = 3
 LIGHT = np.array([0.45, -0.25, 0.86], dtype=np.float32)
 AMBIENT = 0.55
 ORBIT_RADIUS, ORBIT_HEIGHT, ORBIT_SWING = 3.6, 1.9, 0.5
-LOOK_AT = 0.25
-"""Height of what the cameras look at, above the middle of the table."""
-FOCAL = 1.15
-"""Focal length in image widths: 47 degrees across."""
+LOOK_AT = 0.25  # height of what the cameras look at, above the middle of the table
+FOCAL = 1.15  # focal length in image widths: 47 degrees across
 POINT_NOISE = 0.004
 """Standard deviation of the noise on the reconstruction's points; solids are about 1 across."""
 POINTS_PER_VIEW = 150

@@ -26,8 +26,7 @@ FORMS = ["{stem}.png", "{name}.png", "{name}.mask.png", "{stem}_mask.png", "{nam
 MASK_PIXELS = 16
 """Pixels of a mask for each of its photo, at most: where the photo is reduced, the mask need not be. An even mask is a
 file of few bytes."""
-HALF = 128
-"""Value from which a pixel of a JPEG counts, whose compression leaves no exact zeros."""
+HALF = 128  # value from which a pixel of a JPEG counts, whose compression leaves no exact zeros
 
 
 def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[list[Path | None], str]:
@@ -40,8 +39,8 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
     names = [f"{FOLDER}{reduced[0]}", FOLDER] if reduced else [FOLDER]
     parents = dict.fromkeys((scene, capture.photo_folder.parent, capture.photo_folder))
     folders = [parent / name for name in names for parent in parents if (parent / name).is_dir()]
-    finder = mask_finder(folders, capture.photo_folder)
-    found = [file or finder(name) for file, name in zip(capture.mask_files, capture.names, strict=True)]
+    find = mask_finder(folders, capture.photo_folder)
+    found = [file or find(name) for file, name in zip(capture.mask_files, capture.names, strict=True)]
     if files := [file for file in found if file is not None]:
         whole = f"; {len(found) - len(files)} photos without one are whole" if len(files) < len(found) else ""
         return found, f"masks of {len(files)} of {len(found)} photos, as {files[0]}{whole}"
@@ -88,16 +87,12 @@ def mask_finder(folders: Sequence[Path], photos: Path) -> Callable[[str], Path |
 def load_masks(
     files: Sequence[Path | None], photos: Sequence[Path], capture: Capture, sizes: np.ndarray, targets: np.ndarray
 ) -> list[PixelMasks | None]:
-    """Read masks in parallel, undistorted and reduced as the photos are.
+    """Masks of V photos, read in parallel, undistorted and reduced as the photos are; None where every pixel counts.
 
     Args:
         files: V masks, or None.
         photos: the V photos; where the capture's alpha is a mask, their alpha counts too.
-        capture: says what lenses and full sizes the photos have.
         sizes, targets: [V, 2] int64 (width, height) of the photos' files, and that the photos get.
-
-    Returns:
-        One a view; None where every pixel counts.
 
     Raises:
         InputError: a mask that cannot be read, or has neither its photo's nor its camera's size.

@@ -42,10 +42,8 @@ MAPS_OF = (rf"(.+?)[._ -]?(?:{_MAPS}|alpha)(?:[_-]?\d+)?", rf"(?:dynamic_)?{_MAP
 PHOTO_DEPTH = 1
 """Photos are looked for in a folder and in the folders in it. The photos of several captures beside each other lie
 deeper, in the ``images`` of each."""
-FOLDER_DEPTH = 4
-"""Named photos are looked for in folders of a capture, no deeper than this."""
-DEEPEST = 16
-"""Folders of a name that are looked at, the last ones."""
+FOLDER_DEPTH = 4  # named photos are looked for in folders of a capture, no deeper than this
+DEEPEST = 16  # folders of a name that are looked at, the last ones
 IMAGES, REDUCED = "images", tuple(f"images_{factor}" for factor in (2, 4, 8, 16))
 """Folder of the photos, and of copies reduced by a factor."""
 
@@ -107,14 +105,8 @@ def files_below(folder: Path, depth: int = FOLDER_DEPTH, masks: bool = False) ->
 
 
 def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | None:
-    """The path, relative to the scene, of a file that a capture names (`_forms`); None where it is not there.
-
-    Args:
-        folder: of the scene, that names are relative to.
-
-    Raises:
-        InputError: a name that cannot be printed.
-    """
+    """The path, relative to the scene, of a file that a capture names relative to a folder of it (`_forms`); None where
+    it is not there. Raises `InputError` for a name that cannot be printed."""
     require_printable(name, source)
     return next((form for form in _forms(name, folder) if os.path.isfile(f"{scene}/{form}")), None)
 
@@ -173,9 +165,10 @@ def find_named(
         raise InputError(f"{source} names the photo {twice[0]} twice: take one out, or rename the photos")
     missing = [place for place, path in enumerate(found) if path is None]
     index = {} if not missing else _index(scene, {*written, *(PureWindowsPath(other).as_posix() for other in others)})
-    moved = _distinct({place: _best(_beside(index, names[place], folders), names[place]) for place in missing})
-    if not moved and len(missing) == len(found):
-        moved = _distinct({place: _best(index.get(_stem(names[place]), []), names[place]) for place in missing})
+    alike = {place: index.get(_stem(names[place]), []) for place in missing}
+    said = {p: {PurePosixPath(form).parent for at in folders for form in _forms(names[p], at)} for p in missing}
+    beside = {place: [file for file in files if file.parent in said[place]] for place, files in alike.items()}
+    moved = _distinct(beside, names) or (_distinct(alike, names) if len(missing) == len(found) else {})
     pairs = sorted((moved.get(place) or path or "", place) for place, path in enumerate(found))
     pairs = [(path, place) for path, place in pairs if path]
     absent = [written[place] for place in missing if place not in moved]
@@ -186,11 +179,9 @@ def find_named(
             f"{source} names {len(names)} photos, of which {len(absent)} are missing in {scene} ({named(absent)}): at "
             f"least {FEWEST_PHOTOS} are needed; {link or 'copy the photos there'}"
         )
-    notes = []
-    # A suffix alone that names lack is not worth a line.
-    ways = [(path, PureWindowsPath(names[place]).as_posix()) for place, path in moved.items()]
+    notes, ways = [], [(path, PureWindowsPath(names[place]).as_posix()) for place, path in moved.items()]
     if ways := [(path, name) for path, name in ways if str(PurePosixPath(path).with_suffix("")) != name]:
-        path, name = ways[0]
+        path, name = ways[0]  # more than the suffix is another
         notes.append(f"{len(ways)} photos are not where {source.name} says: {path} is taken for {name}, ...")
     if absent:
         said = f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {named(absent, most=1)}"
@@ -199,10 +190,6 @@ def find_named(
     folder = scene / inner.pop() if len(inner) == 1 else scene
     shown = tuple((scene / path).relative_to(folder).as_posix() for path, _ in pairs)
     return FoundPhotos(folder, shown, [place for _, place in pairs], notes)
-
-
-Index = dict[str, list[PurePosixPath]]
-"""Paths of files relative to a scene, by their stems (`_stem`)."""
 
 
 def plain(text: str) -> str:
@@ -216,19 +203,13 @@ def _stem(name: str) -> str:
     return plain(path.stem if path.suffix.lower() in (*NAMED_SUFFIXES, *OTHER_SUFFIXES) else path.name)
 
 
-def _index(scene: Path, others: Collection[str]) -> Index:
-    """The files of a scene that may be photos, but for `others`."""
-    files: Index = defaultdict(list)
+def _index(scene: Path, others: Collection[str]) -> dict[str, list[PurePosixPath]]:
+    """The files of a scene that may be photos, but for `others`, by their stems."""
+    files = defaultdict(list)
     for file in files_below(scene):
         if str(file) not in others and file.suffix.lower() in NAMED_SUFFIXES:
             files[_stem(file.name)].append(file)
     return files
-
-
-def _beside(index: Index, name: str, folders: Sequence[str]) -> list[PurePosixPath]:
-    """The files of a name's stem in a folder that the name says."""
-    places = {PurePosixPath(form).parent for folder in folders for form in _forms(name, folder)}
-    return [file for file in index.get(_stem(name), ()) if file.parent in places]
 
 
 def _best(files: Sequence[PurePosixPath], name: str) -> str:
@@ -241,7 +222,8 @@ def _best(files: Sequence[PurePosixPath], name: str) -> str:
     return str(best[0]) if len(best) == 1 else ""
 
 
-def _distinct(moved: dict[int, str]) -> dict[int, str]:
-    """The places whose file is no other place's."""
-    times = Counter(moved.values())
-    return {place: path for place, path in moved.items() if path and times[path] == 1}
+def _distinct(files: dict[int, list[PurePosixPath]], names: Sequence[str]) -> dict[int, str]:
+    """The file that the name of each place stands for, where it is no other place's."""
+    best = {place: _best(of_place, names[place]) for place, of_place in files.items()}
+    times = Counter(best.values())
+    return {place: path for place, path in best.items() if path and times[path] == 1}

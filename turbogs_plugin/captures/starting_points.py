@@ -18,16 +18,14 @@ from turbogs_plugin.types import Cameras
 from turbogs_plugin.types.gaussians import SH_C0
 
 NUM_RANDOM_POINTS = 50_000
-GREY = 128
-"""Colour of points without one."""
+GREY = 128  # colour of points without one
 MODEL_PROPERTIES = {"opacity", "f_dc_0", "scale_0", "rot_0", "packed_position"}
 """Properties of a .ply of which a model has at least one, and a cloud of points none."""
 LOOKING = 0.9
 """Share of the views that must have one point in their images to be taken for views of one thing."""
 LEAST_SPACING = 1e-2
 """Cameras nearer to each other than this share of their extent are taken to be in one place."""
-COLOR_VIEWS = 32
-"""Photos that give random points their colours, at most."""
+COLOR_VIEWS = 32  # photos that give random points their colours, at most
 
 
 def read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
@@ -60,23 +58,16 @@ def plain_cloud(file: str) -> tuple[np.ndarray, np.ndarray] | None:
 
 def clouds_beside(folders: Sequence[Path], used: Path | None, remedy: str) -> list[str]:
     """A line on clouds in some folders that are not used; none where there is none. `remedy`: how they would be."""
-    files = [file for folder in folders for file in sorted(folder.glob("*.[pP][lL][yY]")) if file != used]
-    return [f"{', '.join(file.name for file in files[:3])} not used: {remedy}"] if files else []
+    files = [file.name for folder in folders for file in sorted(folder.glob("*.[pP][lL][yY]")) if file != used]
+    return [f"{', '.join(files[:3])} not used: {remedy}"] if files else []
 
 
 def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, str]:
-    """Points for a capture without any, the same for the same cameras, and how they were drawn.
+    """[`NUM_RANDOM_POINTS`, 3] float64 for a capture without any, the same for the same cameras: world to camera
+    [V, 4, 4], intrinsics [V, 3, 3] (float64), sizes [V, 2] (width, height). And words that go on from "random points".
 
     Where cameras look at one thing (`LOOKING`), points fill a cube about the point nearest to all viewing axes, whose
     side is the median distance of the cameras from it. Elsewhere they are drawn within the views, by `_depth_bounds`.
-
-    Args:
-        viewmats: [V, 4, 4] float64 world to camera.
-        Ks: [V, 3, 3] float64 intrinsics.
-        sizes: [V, 2] (width, height).
-
-    Returns:
-        [`NUM_RANDOM_POINTS`, 3] float64, and words that go on from "random points".
     """
     centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
     mean = centers.mean(axis=0)
@@ -89,10 +80,9 @@ def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> 
     if inside.mean() < LOOKING:
         within = points_in_views(viewmats, Ks, sizes, np.tile(_depth_bounds(centers), (len(centers), 1)))
         return within, "before the cameras, which do not look at one thing"
-    side = float(np.median(np.linalg.norm(centers - focus, axis=1)))
-    random = np.random.default_rng(0)
-    points = focus + random.uniform(-0.5, 0.5, (NUM_RANDOM_POINTS, 3)) * (side or 1.0)
-    return points, "about what the cameras look at"
+    side = float(np.median(np.linalg.norm(centers - focus, axis=1))) or 1.0
+    within = np.random.default_rng(0).uniform(-0.5, 0.5, (NUM_RANDOM_POINTS, 3))
+    return focus + within * side, "about what the cameras look at"
 
 
 def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
@@ -113,12 +103,8 @@ def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
 def points_in_views(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     """[`NUM_RANDOM_POINTS`, 3] float64 points drawn at random, the same for the same arguments.
 
-    A view and a place in it are drawn evenly, and the inverse of the depth: so the points lie as densely in the image
-    as in depth, as far as parallax can tell depths apart.
-
-    Args:
-        viewmats, Ks, sizes: as for `starting_points`.
-        bounds: [V, 2] float64, nearest and farthest depth.
+    A view and a place in it are drawn evenly, and the inverse of the depth between its nearest and farthest, `bounds`
+    [V, 2]: so the points lie as densely in the image as in depth, as far as parallax can tell depths apart.
     """
     random, count = np.random.default_rng(0), NUM_RANDOM_POINTS
     views = random.integers(0, len(viewmats), count)

@@ -29,8 +29,7 @@ TEST_FILES = ("transforms_test.json", "transforms_val.json")
 """NeRF-synthetic's files of test photos: the first that is there, and has a photo, is used."""
 TRAIN, VALIDATION, TEST = LISTS = ("train_filenames", "val_filenames", "test_filenames")
 """Lists of file names in a ``transforms.json`` that are the capture's own split."""
-TEST_FRAMES = "test_frames"
-"""Frames to test on, which are not among the others (ScanNet++)."""
+TEST_FRAMES = "test_frames"  # frames to test on, which are not among the others (ScanNet++)
 BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 """Names of one model, whose missing coefficients are 0."""
 FISHEYE = "OPENCV_FISHEYE"

@@ -27,12 +27,10 @@ WIDEST_ANGLE = math.radians(60.0)
 """Largest angle off the axis in the pinhole image: a fisheye's rim would become a smear."""
 LARGEST_GROWTH = 2.0
 """The pinhole image has at most this many times the sides of the photo (COLMAP's `max_scale`)."""
-GRID = 129
-"""Places along either side of a pinhole image at which it is checked against the photo."""
+GRID = 129  # places along either side of a pinhole image at which it is checked against the photo
 SMALLEST_SHARE = 0.1
 """A pinhole image that covers less of the photo's width or height is not one of a lens."""
-EDGE = 0.5
-"""Pixels by which the border of the pinhole image may leave the photo."""
+EDGE = 0.5  # pixels by which the border of the pinhole image may leave the photo
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,12 +71,8 @@ class Lens:
 
 def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
     """The lens of a camera of any of COLMAP's models; None for a pinhole, and for an impossible size, which
-    `Capture.checked` refuses.
-
-    Raises:
-        InputError: parameters that are not those of a lens within the photo; a panorama, which no pinhole camera can
-            show; `owner` names the camera.
-    """
+    `Capture.checked` refuses. Raises `InputError` for a panorama, which no pinhole camera can show, and for parameters
+    that are not those of a lens within the photo; `owner` names the camera."""
     model, size = camera.model.name, (camera.width, camera.height)
     bent = model not in STRAIGHT_MODELS or camera.params[list(camera.extra_params_idxs())].any()
     if not bent or max(size) > LARGEST_SIDE:
@@ -108,8 +102,8 @@ def _lens(model: str, size: tuple[int, int], params: tuple[float, ...]) -> Lens 
         pinhole = pycolmap.undistort_camera(_options(), camera)
     except Exception:  # pycolmap raises whatever C++ threw
         return None
-    fits = _fits(camera, pinhole)
-    return Lens(camera, (pinhole.width, pinhole.height), pinhole.calibration_matrix()) if fits else None
+    lens = Lens(camera, (pinhole.width, pinhole.height), pinhole.calibration_matrix())
+    return lens if _fits(lens) else None
 
 
 def _options() -> pycolmap.UndistortCameraOptions:
@@ -120,13 +114,12 @@ def _options() -> pycolmap.UndistortCameraOptions:
     )
 
 
-def _fits(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> bool:
+def _fits(lens: Lens) -> bool:
     """True where the photo of a camera fills the pinhole image, and shows none of it mirrored."""
-    sides, K = (camera.width, camera.height), pinhole.calibration_matrix()
-    x, y = (np.linspace(0.0, side, GRID) for side in (pinhole.width, pinhole.height))
+    sides, K, (x, y) = lens.photo_size, lens.K, (np.linspace(0.0, side, GRID) for side in lens.size)
     rays = np.stack([*np.meshgrid((x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]), np.ones((GRID, GRID))], axis=-1)
     with np.errstate(all="ignore"):
-        places = np.asarray(camera.img_from_cam(rays.reshape(-1, 3)))  # NaN where there is none
+        places = np.asarray(lens.camera.img_from_cam(rays.reshape(-1, 3)))  # NaN where there is none
         least, most = places.min(axis=0), places.max(axis=0)  # NaN fits nowhere
         fits = (least >= -EDGE) & (most <= np.add(sides, EDGE)) & (most - least >= np.multiply(SMALLEST_SHARE, sides))
         places = places.reshape(GRID, GRID, 2)
