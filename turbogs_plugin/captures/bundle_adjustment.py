@@ -1,10 +1,9 @@
 """Bundle adjustment: each photo's own pinhole camera, from where the photo shows the points of a reconstruction.
 
 Reconstructions give all photos of a camera the same lens. A phone's or a drone's photos are not of one: the stabiliser
-shifts lens and sensor, focusing changes the focal length, and a rolling shutter shears what moves. The errors are up to
-half a pixel and systematic across a photo, so photos contradict one another, and a model of them is blurred. Here each
-photo gets its own pose, focal lengths and principal point: cameras and points in turn, by Gauss-Newton steps on squares
-that are reweighted by Cauchy's rule (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000).
+shifts lens and sensor, focusing changes the focal length, and a rolling shutter shears what moves, by up to half a
+pixel. Here each photo gets its own pose, focal lengths and principal point: cameras and points in turn, by Gauss-Newton
+steps on squares that are reweighted by Cauchy's rule (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000).
 
 A prior holds cameras to those that were given: a normal distribution of ten parameters, whose covariance is learnt from
 all photos by expectation-maximisation. So where one lens is right for all of them, cameras stay what they were, however
@@ -12,10 +11,9 @@ few points a photo shows.
 
 All is float64 on the CPU, and the same to the bit in every run, so that a resumed training has the same cameras.
 
-Of a scene, training photos and points are refined together. Test photos keep the cameras that they were given, as
-errors are to be compared with other programs' errors, which are by the given ones. Beside them they get refined ones,
-by where they show the points that training starts from, however that is set: errors by these are of the model alone,
-not of the camera.
+Test photos keep the cameras that they were given, as errors are to be compared with other programs' errors, which are
+by the given ones. Beside them they get refined ones, by where they show the points that training starts from: errors by
+these are of the model alone, not of the camera.
 """
 
 from __future__ import annotations

@@ -36,11 +36,10 @@ class Capture:
         lenses: one a view, None for a pinhole camera; given as empty where all are.
         notes: what the capture was taken for, and what was done with it: lines for the user.
         test: [V] bool, the test views of the capture's own split; None: views are split by their order.
-        alpha: what the alpha of a transparent photo is: the object's ``opacity``, so that the background shows through
-            and training makes the model as transparent; or a ``mask``, whose zero pixels are ignored.
+        alpha: what the alpha of a photo is: the object's ``opacity``, so that the background shows through and training
+            makes the model as transparent; or a ``mask``, whose zero pixels are ignored.
         mask_files: files of masks that the capture names, one a view or None; given as empty where it names none.
-        observations: where photos show the points, in pixels of the full-size photos, undistorted where they have a
-            lens; None: the capture does not say.
+        observations: where photos show the points, in pixels as `Ks` has them; None: the capture does not say.
         doubt: what may be wrong with the poses.
     """
 
@@ -70,11 +69,8 @@ class Capture:
         return np.array([size if lens is None else lens.photo_size for lens, size in both])
 
     def checked(self, source: Path) -> Capture:
-        """This capture without damaged views and points, which a note counts.
-
-        Raises:
-            InputError: no point is finite, or fewer than `FEWEST_PHOTOS` training views are whole.
-        """
+        """This capture without damaged views and points, which a note counts. Raises `InputError` where no point is
+        finite, or fewer than `FEWEST_PHOTOS` training views are whole."""
         if not self.names:
             raise InputError(f"{source} has no images with a pose: reconstruct the capture again")
         posed = np.isfinite(self.viewmats).all(axis=(1, 2))
@@ -91,8 +87,7 @@ class Capture:
             if not ok.all():
                 count, damage = (~ok).sum(), f"'{self.names[ok.argmin()]}' has {trouble}"
                 if left.sum() < min(FEWEST_PHOTOS, len(self.names)):
-                    again = "export or reconstruct it again"
-                    raise InputError(f"{source}: image {damage} ({count} such images): {again}")
+                    raise InputError(f"{source}: image {damage} ({count} such images): export or reconstruct it again")
                 notes.append(f"{count} of {len(self.names)} images are left out as damaged: {damage}")
         if not finite.all():
             if not finite.any():

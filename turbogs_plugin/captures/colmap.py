@@ -30,10 +30,8 @@ TEST = "test.txt"
 
 
 def load_pycolmap() -> ModuleType:
-    """The module, loaded where it is used: other kinds of captures need neither its time nor its presence.
-
-    SIGTERM keeps the handler that Python knows of: pycolmap brings one that prints a trace of C++.
-    """
+    """The module, loaded where it is used: other captures need neither its time nor its presence. SIGTERM keeps the
+    handler that Python knows of: pycolmap brings one that prints a trace of C++."""
     import pycolmap
 
     if threading.current_thread() is threading.main_thread():
@@ -69,13 +67,9 @@ def _models_in(place: Path, needed: Sequence[str]) -> list[tuple[Path, str]]:
 
 
 def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
-    """Read a reconstruction, that `find_model` has found. Its photos are found by `find_named`; images whose photo does
-    not exist are left out.
-
-    Raises:
-        InputError: files that are damaged or inconsistent, a camera that no pinhole can take the place of, or fewer
-            than `FEWEST_PHOTOS` photos.
-    """
+    """Read a reconstruction that `find_model` has found, without images whose photo does not exist (`find_named`).
+    Raises `InputError` for files that are damaged or inconsistent, a camera that no pinhole can take the place of, or
+    fewer than `FEWEST_PHOTOS` photos."""
     load_pycolmap()
     model = read_model(folder, suffix)
     found = find_named(scene, [image.name for image in model.images], folder, (IMAGES, ""))
@@ -89,6 +83,9 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     kind = "binary" if suffix == ".bin" else "text"
     cloud = folder / CLOUD if len(model.points) and model.points["id"][0] >= colmap_files.FIRST_OF_CLOUD else None
     test, split = _own_split(scene, folder, found.names)
+    beside = [other for other, _ in _models_in(folder.parent, FILES)]
+    unused = named([other.name for other in beside if other != folder])
+    choice = f"{len(beside)} reconstructions in {folder.parent}: {folder.name} is taken, the largest; {unused} not used"
     return Capture(
         names=found.names,
         photo_folder=found.folder,
@@ -101,7 +98,7 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
         notes=(
             f"COLMAP reconstruction {folder} ({kind}): {len(images)} images, {len(model.points):,} points"
             f"{f' of {CLOUD}' if cloud else ''}{where}{split}",
-            *_choice_note(folder),
+            *([choice] if folder in beside and unused else []),
             *found.notes,
             *clouds_beside([folder, scene], cloud, f"{CLOUD} is, in a model without points3D"),
             *filter(None, [model.doubt]),
@@ -124,15 +121,6 @@ def _own_split(scene: Path, folder: Path, names: Sequence[str]) -> tuple[np.ndar
     if test.any() and (~test).sum() >= FEWEST_PHOTOS:
         return test, f", by {file.name} {(~test).sum()} for training, {test.sum()} for testing"
     return None, f", {file} not used: {test.sum()} of its names have a photo"
-
-
-def _choice_note(model: Path) -> list[str]:
-    """Which of several reconstructions was taken, where there are several."""
-    folders = [folder for folder, _ in _models_in(model.parent, FILES)]
-    if len(folders) < 2 or model not in folders:
-        return []
-    others = named([folder.name for folder in folders if folder != model])
-    return [f"{len(folders)} reconstructions in {model.parent}: {model.name} is taken, the largest; {others} not used"]
 
 
 def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict[int, Lens | None]) -> Observations:

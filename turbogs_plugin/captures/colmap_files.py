@@ -60,18 +60,13 @@ class ColmapModel(NamedTuple):
 
 
 def read_model(folder: Path, suffix: str) -> ColmapModel:
-    """The reconstruction in a folder. `suffix`: '.bin' or '.txt'.
-
-    Raises:
-        InputError: a file is damaged, or an image has a camera that is not there; the line names file and place.
-    """
+    """The reconstruction in a folder, of files with a suffix. Raises `InputError` where a file is damaged, or an image
+    has a camera that is not there; the line names file and place."""
     cameras, images, points = (folder / f"{file}{suffix}" for file in FILES)
     points = points if points.is_file() or not (folder / CLOUD).is_file() else folder / CLOUD
     if absent := [path.name for path in (cameras, images, points) if not path.is_file()]:
-        raise InputError(
-            f"{folder} has no {' and no '.join(absent)}: bring back what is missing, or take that folder away and find "
-            "the cameras by 'turbogs reconstruct'"
-        )
+        remedy = "bring back what is missing, or take that folder away and find the cameras by 'turbogs reconstruct'"
+        raise InputError(f"{folder} has no {' and no '.join(absent)}: {remedy}")
     known_cameras, known_points = _read_cameras(cameras), _read_points(points)
     known_images: dict[int, ModelImage] = {}
     for record in _records(images):
@@ -189,9 +184,8 @@ class _Text:
         name or has ten words."""
         words = self.lines[self.number].split() if self.number < len(self.lines) else []
         if len(words) == 10 or (len(words) > 10 and not NUMBER.fullmatch(words[-1])):
-            words = []
-        else:
-            self.number += 1
+            return np.zeros(0, FEATURE)
+        self.number += 1
         try:
             numbers = np.array(words, np.float64).reshape(-1, 3)
         except (ValueError, OverflowError):
@@ -229,21 +223,18 @@ class _Binary:
         return start
 
     def take(self, layout: str) -> tuple:
-        """The next numbers, by a layout of the struct module."""
         return struct.unpack_from(f"<{layout}", self.data, self.skip(struct.calcsize(f"<{layout}")))
 
     def end(self) -> None:
         pass  # the next record follows
 
     def name(self) -> str:
-        length = self.data.find(b"\0", self.position) - self.position
-        if length < 0:
+        if (end := self.data.find(b"\0", self.position)) < 0:
             raise _damaged(self.path, f"the image name at byte {self.position} has no end")
-        start = self.skip(length + 1)
-        return self.data[start : start + length].decode(errors="surrogateescape")
+        start = self.skip(end + 1 - self.position)
+        return self.data[start:end].decode(errors="surrogateescape")
 
     def features(self) -> np.ndarray:
-        """[n] of `FEATURE`."""
         (count,) = self.take("Q")
         return np.frombuffer(self.data, FEATURE, count, self.skip(count * FEATURE.itemsize))
 
@@ -273,10 +264,10 @@ def _read_cameras(path: Path) -> dict[int, pycolmap.Camera]:
 def _read_points(path: Path) -> np.ndarray:
     """[M] of `POINT`. In text, colours may have decimals, as shares of white, too, and errors may lack."""
     if path.suffix == ".bin":
-        file, starts = _Binary(path), []
+        file, starts, length = _Binary(path), [], struct.Struct("<Q").unpack_from
         for record in file.records():  # in one go, of one number each: captures have millions of them
-            starts.append(record.skip(POINT.itemsize + 8))
-            record.skip(8 * record.take("Q")[0])
+            starts.append(record.skip(POINT.itemsize + 16))
+            record.skip(8 * length(file.data, file.position - 8)[0])
         if not starts:
             return np.zeros(0, POINT)
         rows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(file.data, "u1"), POINT.itemsize)

@@ -19,8 +19,6 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.host_arrays import host_array
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 
-MODES = {3: "RGB", 4: "RGBa"}
-"""Pillow's modes, by channels; the latter's colours are multiplied by alpha."""
 SMALLEST_SIDE = 4
 """The shorter side of a reduced photo has at least this many pixels; of fewer, nothing is left to see."""
 OPAQUE_SUFFIXES = (".jpg", ".jpeg")
@@ -56,10 +54,8 @@ def reduced_sizes(sizes: np.ndarray, factor: float) -> np.ndarray:
     if factor > 1 and reduced.min() < SMALLEST_SIDE:
         width, height = sizes[sizes.min(axis=1).argmin()].tolist()
         largest = max(1, int(min(width, height) / (SMALLEST_SIDE - 0.5)))
-        raise InputError(
-            f"--factor {factor:g} leaves too little of photos of {width}x{height}: the largest that keeps "
-            f"{SMALLEST_SIDE} pixels a side is {largest}"
-        )
+        remedy = f"the largest that keeps {SMALLEST_SIDE} pixels a side is {largest}"
+        raise InputError(f"--factor {factor:g} leaves too little of photos of {width}x{height}: {remedy}")
     return reduced
 
 
@@ -83,14 +79,12 @@ def is_transparent(image: Image.Image) -> bool:
 def channels_of(paths: Sequence[Path]) -> int:
     """4 where a photo may be transparent, by the headers, else 3."""
 
-    def channels(path: Path) -> int:
-        if path.suffix.lower() in OPAQUE_SUFFIXES:
-            return 3
+    def transparent(path: Path) -> bool:
         with opened_image(path) as image:
-            return 4 if is_transparent(image) else 3
+            return is_transparent(image)
 
     with decoding_threads() as pool:
-        return max(pool.map(channels, paths))
+        return 4 if any(pool.map(transparent, (p for p in paths if p.suffix.lower() not in OPAQUE_SUFFIXES))) else 3
 
 
 def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
@@ -106,9 +100,8 @@ def load_photos(
     channels: int = 3,
     progress: Callable[[int, int], object] | None = None,
 ) -> Photos:
-    """Decode V photos in parallel, undistorted, then reduced to their target sizes by area averaging.
-
-    Photos are taken as stored: an orientation in EXIF is ignored, as COLMAP does.
+    """Decode V photos in parallel, undistorted, then reduced to their target sizes by area averaging. They are taken as
+    stored: an orientation in EXIF is ignored, as COLMAP does.
 
     Args:
         targets: [V, 2] int64 (width, height) to give them.
@@ -118,10 +111,10 @@ def load_photos(
         progress: called with the number of photos decoded so far, and of all.
 
     Raises:
-        InputError: a photo that cannot be decoded (the first one in order is named); more photos than fit in memory or
-            on the disk.
+        InputError: a photo that cannot be decoded, the first one in order; more photos than fit in memory or on disk.
     """
-    offsets = pixel_offsets(targets)
+    # Pillow's mode with an a has colours that are multiplied by alpha.
+    offsets, mode = pixel_offsets(targets), "RGBa" if channels == 4 else "RGB"
 
     def room(channels: int) -> Tensor:
         """[X, channels] uint8, with any content."""
@@ -132,7 +125,9 @@ def load_photos(
 
     def load(view: int) -> bool:
         """Decode a photo; True where it is opaque."""
-        target, lens, photo = tuple(targets[view].tolist()), lenses[view], _decode(paths[view], MODES[channels])
+        target, lens = tuple(targets[view].tolist()), lenses[view]
+        with opened_image(paths[view]) as image:
+            photo = (image.convert("RGBA") if channels == 4 or is_transparent(image) else image).convert(mode)
         if lens is not None:
             photo = lens.undistort(photo)
         if photo.size != target:
@@ -157,14 +152,6 @@ def decoding_threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, min(MOST_THREADS, processor_cores())))
 
 
-def _decode(path: Path, mode: str) -> Image.Image:
-    """An image of exactly this mode, or `InputError`."""
-    with opened_image(path) as image:
-        if mode == "RGBa" or is_transparent(image):
-            image = image.convert("RGBA")
-        return image.convert(mode)
-
-
 @contextmanager
 def opened_image(
     path: Path, what: str = "photo", remedy: str = "copy it there again", pixels: int = ALWAYS_PIXELS
@@ -177,15 +164,11 @@ def opened_image(
         with Image.open(path, formats=(*FORMATS, other) if other else FORMATS) as image:
             stored = path.stat().st_size
             if image.width * image.height > max(pixels, PIXELS_A_BYTE * stored):
-                raise InputError(
-                    f"{what} {path} has {image.width}x{image.height} pixels in {stored} bytes, which no {what} has: "
-                    "replace it or take it out"
-                )
+                size = f"{image.width}x{image.height} pixels in {stored} bytes"
+                raise InputError(f"{what} {path} has {size}, which no {what} has: replace it or take it out")
             if image.format == "TIFF" and image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
-                raise InputError(
-                    f"{what} {path} is a TIFF with an orientation in its EXIF data: take that out, or save it upright "
-                    "before cameras are found"
-                )
+                upright = "take that out, or save it upright before cameras are found"
+                raise InputError(f"{what} {path} is a TIFF with an orientation in its EXIF data: {upright}")
             yield image
     except InputError:
         raise

@@ -40,17 +40,13 @@ PHOTO_NAME = "view_{:03d}.png"
 
 @dataclass
 class Solid:
-    """A solid on the vertical axis of its own coordinates, placed by a turn about it in radians and a translation [3].
+    """A solid on the vertical axis of its own coordinates. In these, `intersect` gives distances [R] along rays from
+    `origin` [3] in `directions` [R, 3], infinite where they miss it; `normal`, outward unit normals [R, 3] at points."""
 
-    In own coordinates, `intersect` gives distances [R] along rays from `origin` [3] in `directions` [R, 3], infinite
-    where they miss it, and `normal` outward unit normals [R, 3] at surface points. `size`: radius, or half of each side
-    of a box [3].
-    """
-
-    size: float | np.ndarray
+    size: float | np.ndarray  # radius, or half of each side of a box [3]
     texture: Texture
-    position: np.ndarray
-    turn: float
+    position: np.ndarray  # [3], of its origin in the world
+    turn: float  # about the axis, radians
 
     @property
     def rotation(self) -> np.ndarray:
@@ -94,11 +90,8 @@ class Disc(Solid):
 
 
 def checker(size: float, first: np.ndarray, second: np.ndarray) -> Texture:
-    def colors(points: np.ndarray) -> np.ndarray:
-        odd = np.floor(points / size + 0.25).sum(axis=1) % 2 > 0.5
-        return np.where(odd[:, None], first, second)
-
-    return colors
+    """Cubes of two colours in turn."""
+    return lambda points: np.where((np.floor(points / size + 0.25).sum(axis=1) % 2 > 0.5)[:, None], first, second)
 
 
 def noise(size: float, first: np.ndarray, second: np.ndarray, random: np.random.Generator) -> Texture:
@@ -113,7 +106,10 @@ def noise(size: float, first: np.ndarray, second: np.ndarray, random: np.random.
     return colors
 
 
-def demo_solids(random: np.random.Generator) -> list[Sphere | Box | Disc]:
+Solids = list[Sphere | Box | Disc]
+
+
+def demo_solids(random: np.random.Generator) -> Solids:
     """Five solids on a round table; colours, textures and turns are drawn from `random`."""
     turn, vector = partial(random.uniform, 0, np.pi), partial(np.array, dtype=np.float32)
 
@@ -133,9 +129,7 @@ def demo_solids(random: np.random.Generator) -> list[Sphere | Box | Disc]:
     ]
 
 
-def cast(
-    solids: list[Sphere | Box | Disc], origin: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def cast(solids: Solids, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[R, 3] colours and [R] distances of what rays see; black at infinity where they see nothing."""
     local = [(solid, (origin - solid.position) @ solid.rotation, directions @ solid.rotation) for solid in solids]
     hits = [solid.intersect(*rays) for solid, *rays in local]  # [S, R]
@@ -150,14 +144,9 @@ def cast(
 
 
 def write_demo_capture(path: str | Path, seed: int = 0, views: int = 32, width: int = 160, height: int = 120) -> Path:
-    """Write the demo capture to the new folder `path`: ``images/*.png`` and ``sparse/0``.
-
-    The same arguments give the same pixels, cameras and points.
-
-    Raises:
-        InputError: `path` is there already, or cannot be written; or fewer than 3 views or an image without area are
-            asked for. Then nothing is written.
-    """
+    """Write the demo capture to the new folder `path`: ``images/*.png`` and ``sparse/0``, the same for the same
+    arguments. Raises `InputError`, and writes nothing, where `path` is there already or cannot be written, or fewer
+    than 3 views or an image without area are asked for."""
     target = Path(path)
     if target.exists():
         raise InputError(f"{target} is there already: choose a new folder for the demo capture")

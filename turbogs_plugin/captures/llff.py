@@ -23,11 +23,8 @@ AGAIN = "write it again with LLFF's imgs2poses.py"
 
 def read_llff(scene: Path) -> Capture:
     """Read a capture, with the largest photos that are there. There are no points: they are drawn within the views,
-    between the bounds of depth.
-
-    Raises:
-        InputError: a file of another shape, poses or bounds that make no sense, another number of photos.
-    """
+    between the bounds of depth. Raises `InputError` for a file of another shape, poses or bounds that make no sense,
+    another number of photos."""
     source = scene / FILE
     table = _read_table(source)
     matrices, bounds = table[:, :15].reshape(-1, 3, 5), table[:, 15:]
@@ -83,10 +80,8 @@ def _read_table(source: Path) -> np.ndarray:
         usable = np.isfinite(lens).all(axis=1) & (lens > 0).all(axis=1)
         usable &= np.isfinite(far) & np.isfinite(1.0 / near) & (near > 0) & (near < far)
     if not usable.all():
-        raise InputError(
-            f"{source}: row {int(np.argmin(usable))} has no positive height, width and focal length, or bounds of "
-            f"depth that are not 0 < near < far: {AGAIN}"
-        )
+        trouble = "no positive height, width and focal length, or bounds of depth that are not 0 < near < far"
+        raise InputError(f"{source}: row {int(np.argmin(usable))} has {trouble}: {AGAIN}")
     return table
 
 

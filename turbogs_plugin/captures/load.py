@@ -89,7 +89,8 @@ def load_scene(
         if not isinstance(number, int) or number < 1:
             raise InputError(f"{name} is {number}: it must be an integer of at least 1")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
-        capture = _with_points(read_capture(scene))
+        capture = read_capture(scene)
+        capture = capture if len(capture.points) else _with_points(capture)
     test = _test_views(scene, capture, test_every)
     if validation:
         note = f"{test.sum()} test photos are left out: photos that choose settings are among the others"
@@ -100,9 +101,8 @@ def load_scene(
         frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
     points = torch.from_numpy(frame.normalise_points(capture.points)).float()  # [M, 3]
     if (far := ~(points.abs() < FARTHEST).all(dim=1)).any():
-        raise InputError(
-            f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32: take them out"
-        )
+        trouble = f"{int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32"
+        raise InputError(f"{scene}: {trouble}: take them out")
     files, file_sizes, sizes, size_note = _find_photos(scene, capture, factor)
     mask_files, mask_note = find_masks(scene, capture, files)
     masks = load_masks(mask_files, files, capture, file_sizes, sizes)
@@ -110,10 +110,8 @@ def load_scene(
     parts = [np.flatnonzero(part & seen) for part in (~test, test)]
     for name, part, views in zip(("training", "test"), (~test, test), parts, strict=True):
         if not len(views):
-            raise InputError(
-                f"{scene}: all {part.sum()} {name} photos are masked whole: zero in a mask, or in "
-                "the alpha of a photo, is masked; mend the masks, or take them away"
-            )
+            how = "zero in a mask, or in the alpha of a photo, is masked; mend the masks, or take them away"
+            raise InputError(f"{scene}: all {part.sum()} {name} photos are masked whole: {how}")
     views, count = np.concatenate(parts), len(parts[0])
     paths, lenses = ([of_view[view] for view in views] for of_view in (files, capture.lenses))
     channels = channels_of(paths) if capture.alpha == "opacity" else 3
@@ -164,9 +162,7 @@ def _posed(
 
 
 def _with_points(capture: Capture) -> Capture:
-    """The capture, with points drawn about what its training cameras look at where it has none."""
-    if len(capture.points):
-        return capture
+    """The capture, with points drawn about what its training cameras look at."""
     train = slice(None) if capture.test is None or capture.test.all() else ~capture.test
     points, how = starting_points(capture.viewmats[train], capture.Ks[train], capture.sizes[train])
     note = f"{len(points):,} random points are drawn {how}, as the capture has none"
@@ -203,9 +199,6 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path]
     Returns:
         Paths; [V, 2] int64 (width, height) of the files; [V, 2] int64 to give them, undistorted and reduced; a note on
         photos of another size than their cameras.
-
-    Raises:
-        InputError: a photo that is too small for its lens; or no scaled copy, to a pixel, of one of its camera's size.
     """
     cameras, bent = capture.photo_sizes, np.array([lens is not None for lens in capture.lenses])
     copies = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
@@ -238,13 +231,9 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path]
 
 
 def read_capture(scene: Path) -> Capture:
-    """The capture in a folder, of the first kind that can be read, in the order that `load_scene` states.
-
-    Notes say which other kinds are not used, and why where they come before.
-
-    Raises:
-        InputError: the folder is no capture, with what to do; or no kind can be read: what the first lacks.
-    """
+    """The capture in a folder, of the first kind that can be read, in the order that `load_scene` states. Notes say
+    which other kinds are not used, and why where they come before. Raises `InputError` where the folder is no capture,
+    with what to do; or no kind can be read: what the first lacks."""
     if not scene.is_dir():
         trouble = f"{scene} is a file" if scene.is_file() else f"{scene} does not exist"
         raise InputError(f"no such scene: {unread(scene) or f'{trouble}: give the folder of a capture, or of photos'}")

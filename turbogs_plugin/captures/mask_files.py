@@ -19,6 +19,7 @@ from turbogs_plugin.captures.decoding import OPAQUE_SUFFIXES, decoding_threads, 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks
 
+Size = tuple[int, int]  # (width, height)
 FOLDER = "masks"
 CONVENTIONS = "NAME.png, NAME.EXTENSION.png or NAME.jpg"
 FORMS = ["{stem}.png", "{name}.png", "{name}.mask.png", "{stem}_mask.png", "{name}", "{stem}.jpg", "{stem}.jpeg"]
@@ -30,11 +31,9 @@ HALF = 128  # value from which a pixel of a JPEG counts, whose compression leave
 
 
 def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[list[Path | None], str]:
-    """The file of the mask of each of the V photos, None where there is none, and what to tell the user of it.
-
-    Masks that the capture names come first. Others are found by `mask_finder`, in the capture or beside the folder of
-    its photos. For photos of ``images_4``, masks of ``masks_4`` come first.
-    """
+    """The file of each photo's mask, None where there is none, and what to tell the user of it. Masks that the capture
+    names come first, then those that `mask_finder` finds in the capture or beside the folder of its photos: for photos
+    of ``images_4`` in ``masks_4``, and in ``masks``."""
     reduced = re.search(r"_\d+$", photos[0].parents[len(PurePosixPath(capture.names[0]).parts) - 1].name)
     names = [f"{FOLDER}{reduced[0]}", FOLDER] if reduced else [FOLDER]
     parents = dict.fromkeys((scene, capture.photo_folder.parent, capture.photo_folder))
@@ -50,8 +49,7 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
 
 
 def _misnamed(parents: Iterable[Path]) -> str:
-    """A note on the first folder of images in these that is called like one of masks, and not `FOLDER`; empty where
-    there is none."""
+    """A note on the first folder of images in these that is called like one of masks, and not `FOLDER`; or empty."""
     for folder in (entry for parent in parents if parent.is_dir() for entry in sorted(parent.iterdir())):
         called = re.fullmatch(photo_files.MASKS, folder.name, re.IGNORECASE) and folder.name != FOLDER
         if called and photo_files.find_photos(folder)[1]:
@@ -89,13 +87,9 @@ def load_masks(
 ) -> list[PixelMasks | None]:
     """Masks of V photos, read in parallel, undistorted and reduced as the photos are; None where every pixel counts.
 
-    Args:
-        files: V masks, or None.
-        photos: the V photos; where the capture's alpha is a mask, their alpha counts too.
-        sizes, targets: [V, 2] int64 (width, height) of the photos' files, and that the photos get.
-
-    Raises:
-        InputError: a mask that cannot be read, or has neither its photo's nor its camera's size.
+    `sizes`, `targets`: [V, 2] int64 (width, height) of the photos' files, and that the photos get. Where the capture's
+    alpha is a mask, the photos' alpha counts, too. Raises `InputError` for a mask that cannot be read, or has neither
+    its photo's nor its camera's size.
     """
     full_sizes = capture.photo_sizes
 
@@ -118,7 +112,7 @@ def load_masks(
         return list(pool.map(load, range(len(photos))))
 
 
-def _read(file: Path, photo: Path, size: tuple[int, int], full_size: tuple[int, int]) -> np.ndarray:
+def _read(file: Path, photo: Path, size: Size, full_size: Size) -> np.ndarray:
     """[height, width] bool: the mask, in the size of the photo."""
     with opened_image(file, "mask", pixels=MASK_PIXELS * size[0] * size[1]) as image:
         require_mask_size(file, image.size, photo, size, full_size)
@@ -132,15 +126,12 @@ def _read(file: Path, photo: Path, size: tuple[int, int], full_size: tuple[int, 
     return _reduced(np.asarray(keep), size)
 
 
-def require_mask_size(
-    file: Path, mask_size: tuple[int, int], photo: Path, size: tuple[int, int], other: tuple[int, int]
-) -> None:
-    """Raise `InputError` unless a mask has its photo's `size`, or the `other` one that will do; (width, height)."""
+def require_mask_size(file: Path, mask_size: Size, photo: Path, size: Size, other: Size) -> None:
+    """Raise `InputError` unless a mask has its photo's `size`, or the `other` one that will do."""
     if mask_size not in (size, other):
-        raise InputError(
-            f"mask {file} is {mask_size[0]}x{mask_size[1]} but photo {photo} is {size[0]}x{size[1]}: make it of the "
-            "photo's size, nonzero where a pixel counts"
-        )
+        mask, wanted = (f"{width}x{height}" for width, height in (mask_size, size))
+        remedy = "make it of the photo's size, nonzero where a pixel counts"
+        raise InputError(f"mask {file} is {mask} but photo {photo} is {wanted}: {remedy}")
 
 
 def _image(keep: np.ndarray) -> Image.Image:
@@ -148,7 +139,7 @@ def _image(keep: np.ndarray) -> Image.Image:
     return Image.fromarray(np.where(keep, np.uint8(255), np.uint8(0)))
 
 
-def _reduced(keep: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def _reduced(keep: np.ndarray, size: Size) -> np.ndarray:
     """[H, W] bool of `size` (width, height): True where all that a pixel is made of is True."""
     image = _image(keep)
     return np.asarray(image if image.size == size else image.resize(size, Image.Resampling.BOX)) == 255

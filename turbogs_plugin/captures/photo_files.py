@@ -67,8 +67,8 @@ def maps_beside(files: Iterable[Path]) -> list[Path]:
 
 
 def unread(path: Path, every: bool = False) -> str:
-    """What is not read of the file `path` or in a folder, and what to do; empty where there is nothing. `every`: also
-    files of kinds that captures have nothing to do with."""
+    """What is not read of the file `path` or in a folder, and what to do; or empty. `every`: also files of kinds that
+    captures have nothing to do with."""
     entries = [path, *(path.iterdir() if path.is_dir() else ()), *((path / IMAGES).glob("*"))]
     said = [link for entry in sorted(entries) if (link := broken_link(entry))][:1]
     files = [path] if path.is_file() else [path / file for file in files_below(path, PHOTO_DEPTH)]
@@ -89,7 +89,7 @@ def unread(path: Path, every: bool = False) -> str:
 
 
 def broken_link(path: Path) -> str:
-    """A line where a path, or a folder that it lies in, is a link to what is not there; empty where it is none."""
+    """A line where a path, or a folder that it lies in, is a link to what is not there; or empty."""
     broken = (part for part in (path, *path.parents) if part.is_symlink() and not part.exists())
     return next((f"{part} is a link to {os.readlink(part)}, which is not there: copy that here" for part in broken), "")
 
@@ -175,10 +175,8 @@ def find_named(
     links = (broken_link(scene / form) for name in absent[:1] for place in folders for form in _forms(name, place))
     link = next(filter(None, links), "")
     if absent and len(pairs) < FEWEST_PHOTOS:
-        raise InputError(
-            f"{source} names {len(names)} photos, of which {len(absent)} are missing in {scene} ({named(absent)}): at "
-            f"least {FEWEST_PHOTOS} are needed; {link or 'copy the photos there'}"
-        )
+        lacking = f"{len(absent)} are missing in {scene} ({named(absent)}): at least {FEWEST_PHOTOS} are needed"
+        raise InputError(f"{source} names {len(names)} photos, of which {lacking}; {link or 'copy the photos there'}")
     notes, ways = [], [(path, PureWindowsPath(names[place]).as_posix()) for place, path in moved.items()]
     if ways := [(path, name) for path, name in ways if str(PurePosixPath(path).with_suffix("")) != name]:
         path, name = ways[0]  # more than the suffix is another

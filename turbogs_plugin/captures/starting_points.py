@@ -86,9 +86,8 @@ def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> 
 
 
 def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
-    """Nearest and farthest depth that cameras at `centers` [V, 3] can tell from others, as a guess: ten times the
-    extent, the median distance from the mean. Along a path, what is seen is nearer than that: the nearest depth is the
-    geometric mean of extent and spacing, at most half the extent."""
+    """Nearest and farthest depth that cameras at `centers` [V, 3] can tell from others, as a guess: the geometric mean
+    of extent (the median distance from the mean) and spacing, at most half the extent; and ten times the extent."""
     mean = centers[0] + (centers - centers[0]).mean(axis=0)
     extent = float(np.median(np.linalg.norm(centers - mean, axis=1)))
     if extent <= 1e-12 * np.abs(centers).max():  # all in one place but for rounding

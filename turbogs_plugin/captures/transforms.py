@@ -44,12 +44,9 @@ Frame = dict[str, Any]
 
 
 def read_transforms(scene: Path) -> Capture:
-    """Read ``scene/transforms.json``, with the split of its lists, and points of its ``ply_file_path``.
-
-    Raises:
-        InputError: a file that is not such JSON, lacks something or describes no lens; a photo that two frames name;
-            lists that are no split; a cloud that is absent or damaged.
-    """
+    """Read ``scene/transforms.json``, with the split of its lists, and points of its ``ply_file_path``. Raises
+    `InputError` for a file that is not such JSON, lacks something or describes no lens; a photo that two frames name;
+    lists that are no split; a cloud that is absent or damaged."""
     content, frames = _frames(source := scene / FILE)
     train, test = _own_split(content, [_written(frame) for frame in frames], source)
     used = [frame for frame in frames if _written(frame) in train | test]
@@ -71,7 +68,7 @@ def read_blender(scene: Path) -> Capture:
 
 
 def read_frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """A transforms file, and its frames under a key, but for null and empty texts, which other writers have for what is
+    """A transforms file and its frames under a key, without null and empty texts, which other writers have for what is
     absent. Raises `InputError` unless it is JSON with a list of frames."""
     content = parse_json(text_of(source), str(source))
     frames = content.get(key) if isinstance(content, dict) else None
@@ -100,10 +97,8 @@ def _capture(
 ) -> Capture:
     """The capture of some frames, in the order of their photos' names; damaged poses are left out (`Capture.checked`).
 
-    Args:
-        content: of the file; its ``ply_file_path`` has the points.
-        test: written names of the test photos; where none of them exists, there is no own split.
-        words: on the kind of capture.
+    `content` is the file's, whose ``ply_file_path`` has the points; `test` has written names of the test photos: where
+    none of them exists, there is no own split; `words` are on the kind of capture.
     """
     names, cloud = [_written(frame) for frame in frames], content.get("ply_file_path")
     others = {text for frame in frames for key, text in frame.items() if key != "file_path" and isinstance(text, str)}
@@ -151,9 +146,7 @@ def _own_split(content: dict[str, Any], written: list[str], source: Path) -> tup
     without any list.
 
     Test photos are in ``test_filenames``; where that is absent or empty, in ``val_filenames``. Where both are, all
-    photos that are not for training are tests. Without ``train_filenames``, what is in no other list trains. Raises
-    `InputError` for lists that are no split.
-    """
+    photos that are not for training are tests. Without ``train_filenames``, what is in no other list trains."""
     lists, everything = {key: content[key] for key in LISTS if content.get(key)}, set(written)
     if not lists:
         return everything, set()
@@ -164,10 +157,8 @@ def _own_split(content: dict[str, Any], written: list[str], source: Path) -> tup
         test = test or validation or everything - train
         if train and test and not train & test and train | test | validation <= everything:
             return train, test
-    raise InputError(
-        f"{source}: {', '.join(lists)} are no split: give lists of frames' file_path, with photos to train and to test "
-        "on and none for both"
-    )
+    remedy = "give lists of frames' file_path, with photos to train and to test on and none for both"
+    raise InputError(f"{source}: {', '.join(lists)} are no split: {remedy}")
 
 
 def _file(scene: Path, name: Any, what: str, source: Path) -> Path:
@@ -201,23 +192,17 @@ def _read_camera(values: Frame, photo: Path, source: Path) -> tuple[np.ndarray, 
         raise InputError(f"{owner} is {width:g}x{height:g} pixels: write the photo's size as w and h, or take them out")
     K, size = pinhole(values, source, (width, height)), (round(width), round(height))
     if K is None:
-        raise InputError(
-            f"{owner} has neither fl_x nor a camera_angle_x in 0 .. pi: write one of them there (pixels, radians), or "
-            "find the cameras anew by 'turbogs reconstruct' on a folder of the photos alone"
-        )
+        remedy = "write one of them there (pixels, radians), or find the cameras anew by 'turbogs reconstruct'"
+        raise InputError(f"{owner} has neither fl_x nor a camera_angle_x in 0 .. pi: {remedy}")
     fisheye = str(values.get("is_fisheye")).lower() in ("true", "1")
     model = str(values.get("camera_model", FISHEYE if fisheye else "OPENCV")).upper()
     if model not in (*BROWN_MODELS, FISHEYE):
-        raise InputError(
-            f"{owner} is a {model[:40]!r}: known are {', '.join((*BROWN_MODELS, FISHEYE))}; convert the capture "
-            "with ns-process-data, or use its COLMAP reconstruction"
-        )
+        known = ", ".join((*BROWN_MODELS, FISHEYE))
+        raise InputError(f"{owner} is a {model[:40]!r}: known are {known}; use the capture's COLMAP reconstruction")
     bends = {key: number(key, 0.0) or 0.0 for key in BENDS}
     known = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "k3", "p1", "p2")
-    if unknown := [key for key, value in bends.items() if value and key not in known]:
-        raise InputError(
-            f"{owner} has {' and '.join(unknown)}, which {model} does not have: use the capture's COLMAP reconstruction"
-        )
+    if unknown := " and ".join(key for key, value in bends.items() if value and key not in known):
+        raise InputError(f"{owner} has {unknown}, which {model} does not have: use the capture's COLMAP reconstruction")
     if model != FISHEYE and not any(bends.values()):
         return K, size, None
     kind, keys = ("FULL_OPENCV", BENDS) if bends["k3"] else ("OPENCV", BENDS[:4])

@@ -48,8 +48,8 @@ class Lens:
         return self.camera.width, self.camera.height
 
     def size_of(self, photo_size: tuple[int, int]) -> tuple[int, int]:
-        """(width, height) of the pinhole's image for photos of another size than those that it was calibrated on:
-        smaller for smaller ones, and no larger for larger ones."""
+        """(width, height) of the pinhole's image for photos of a size: smaller for ones below `photo_size`, no larger for
+        others."""
         ratios = np.divide(photo_size, self.photo_size).clip(max=1.0)
         width, height = np.floor(np.multiply(self.size, ratios) + 0.5).astype(np.int64).clip(min=1).tolist()
         return width, height
@@ -78,15 +78,12 @@ def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
     if not bent or max(size) > LARGEST_SIDE:
         return None
     if not camera.is_perspective():
-        raise InputError(
-            f"{owner} is {model}, a panorama: cut it into perspective photos and reconstruct these "
-            "(pycolmap's example panorama_sfm.py does both)"
-        )
+        remedy = "cut it into perspective photos and reconstruct these (pycolmap's example panorama_sfm.py does both)"
+        raise InputError(f"{owner} is {model}, a panorama: {remedy}")
     if (lens := _lens(model, size, tuple(camera.params.tolist()))) is None:
-        raise InputError(
-            f"{owner} is {model} with parameters that are not those of a lens, or whose image folds within the photo: "
-            "reconstruct the capture again, with the model OPENCV_FISHEYE for a wide lens"
-        )
+        trouble = "with parameters that are not those of a lens, or whose image folds within the photo"
+        remedy = "reconstruct the capture again, with the model OPENCV_FISHEYE for a wide lens"
+        raise InputError(f"{owner} is {model} {trouble}: {remedy}")
     return lens
 
 
