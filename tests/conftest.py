@@ -58,10 +58,7 @@ def plotted(request, monkeypatch) -> None:
 @pytest.fixture
 def few_random_points(monkeypatch) -> None:
     """Captures without points start from 500 random ones, not 50,000, which take longer than all else of a load."""
-    from turbogs_plugin.captures import llff, starting_points
-
-    for module in (starting_points, llff):
-        monkeypatch.setattr(module, "NUM_RANDOM_POINTS", 500)
+    monkeypatch.setattr("turbogs_plugin.captures.starting_points.NUM_RANDOM_POINTS", 500)
 
 
 @pytest.fixture

@@ -9,8 +9,7 @@ import torch
 from helpers.tracked import HEIGHT, WIDTH, tracked, write_tracked
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.captures.bundle_adjustment import reprojection_errors
-from turbogs_plugin.captures.camera_refinement import _pinholes, find_cameras, refine_cameras
+from turbogs_plugin.captures.bundle_adjustment import _pinholes, find_cameras, refine_cameras, reprojection_errors
 from turbogs_plugin.config.sections import SceneConfig
 from turbogs_plugin.distributed.ranks import Ranks
 from turbogs_plugin.engine.render_pass import RasterSettings

@@ -15,7 +15,7 @@ from PIL import Image
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import find_model, read_colmap
-from turbogs_plugin.captures.kinds import holds_photos_alone
+from turbogs_plugin.captures.load import holds_photos_alone
 from turbogs_plugin.errors import InputError
 
 

@@ -91,7 +91,7 @@ def test_what_ends_it_ends_the_decoding(capture, monkeypatch):
         time.sleep(0.2)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(decoding, "_decode", stopped)
+    monkeypatch.setattr(decoding, "opened_image", stopped)
     monkeypatch.setattr(decoding, "processor_cores", lambda: 1)
     with pytest.raises(KeyboardInterrupt):
         load_scene(capture)

@@ -15,7 +15,7 @@ from helpers.refusals import assert_refused
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.captures.kinds import holds_photos_alone, other_poses
+from turbogs_plugin.captures.load import holds_photos_alone, other_poses
 from turbogs_plugin.scene import Scene
 
 POINTS = np.array([[0.3, 0.0, 0.1], [-0.2, 0.25, -0.3], [0.0, -0.4, 0.35]])

@@ -12,8 +12,7 @@ from helpers.tracked import HEIGHT, WIDTH, tracked, write_tracked
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.captures.bundle_adjustment import Pinholes
-from turbogs_plugin.captures.camera_refinement import refine_cameras
+from turbogs_plugin.captures.bundle_adjustment import Pinholes, refine_cameras
 from turbogs_plugin.export import refined_capture
 from turbogs_plugin.export.refined_capture import write_refined
 

@@ -12,7 +12,7 @@ from helpers.textured_corner import camera_centers, render_corner, write_photos
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.captures.kinds import holds_photos_alone
+from turbogs_plugin.captures.load import holds_photos_alone
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct import Solution, reconstruct, run, solver
 from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups

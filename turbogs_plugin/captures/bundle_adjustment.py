@@ -1,40 +1,43 @@
 """Bundle adjustment: each photo's own pinhole camera, from where the photo shows the points of a reconstruction.
 
 Reconstructions give all photos of a camera the same lens. A phone's or a drone's photos are not of one: the stabiliser
-shifts lens and sensor, focusing changes the focal length, and a rolling shutter shears what moves. The errors are up to
-half a pixel and systematic across a photo, so photos contradict one another, and a model of them is blurred. Here each
-photo gets its own pose, focal lengths and principal point: cameras and points in turn, by Gauss-Newton steps on squares
-that are reweighted by Cauchy's rule (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000).
+shifts lens and sensor, focusing changes the focal length, and a rolling shutter shears what moves, by up to half a
+pixel. Here each photo gets its own pose, focal lengths and principal point: cameras and points in turn, by Gauss-Newton
+steps on squares that are reweighted by Cauchy's rule (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000).
 
 A prior holds cameras to those that were given: a normal distribution of ten parameters, whose covariance is learnt from
 all photos by expectation-maximisation. So where one lens is right for all of them, cameras stay what they were, however
 few points a photo shows.
 
 All is float64 on the CPU, and the same to the bit in every run, so that a resumed training has the same cameras.
+
+Test photos keep the cameras that they were given, as errors are to be compared with other programs' errors, which are
+by the given ones. Beside them they get refined ones, by where they show the points that training starts from: errors by
+these are of the model alone, not of the camera.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from turbogs_plugin.scene.scene import Observations
+from turbogs_plugin.scene.scene import Observations, Scene
+from turbogs_plugin.types import Cameras
 
-ROUNDS, CAMERA_STEPS, POINT_STEPS = 6, 2, 1
-RESECTION_STEPS = 10
+ROUNDS, CAMERA_STEPS, RESECTION_STEPS = 6, 2, 10
 PRIOR = 0.006
 """Standard deviation of every parameter of a camera before any is learnt, in the units of `Pinholes.moved`: four to six
 pixels at the edge of a photo of 1200."""
-SMALLEST_VARIANCE = 1e-14
-"""Smallest variance in the prior, so that it can be inverted."""
+SMALLEST_VARIANCE = 1e-14  # smallest variance in the prior, so that it can be inverted
 POINT_DAMPING = 1e-4
 """Damping of a point's normal equations, relative to their trace: a point stays in a direction that no photo tells."""
-FEWEST_OBSERVATIONS = 30
-"""A photo with fewer keeps its camera: three a parameter."""
+FEWEST_OBSERVATIONS = 30  # a photo with fewer keeps its camera: three a parameter
 FINEST = 0.02
 """Pixels: errors below are not taken for noise of the features, however exact a reconstruction is."""
 FARTHEST_MATCH = 0.02
@@ -46,38 +49,24 @@ DERIVATIVES = (
     ((0, 0, -1), (0, 5, -1), (1, 4, 1), (2, 1, 1), (4, 6, 1), (5, 8, -1), (7, 2, 1)),
 )
 """Derivatives of a pixel's x and y by parameters of `Pinholes.moved` but the principal point: (parameter, function of
-`_Adjustment._camera_sums`, sign), in units of the focal length, and from function 6 on of the depth."""
+`_Adjustment.move_cameras`, sign), in units of the focal length, and from function 6 on of the depth."""
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 """Rows and columns of the entries of a symmetric 3x3 matrix that are computed."""
 
 
-@dataclass(frozen=True)
-class Pinholes:
-    """V cameras in float64.
+class Pinholes(NamedTuple):
+    """V cameras in float64."""
 
-    Args:
-        rotations: [V, 3, 3], world to camera.
-        translations: [V, 3].
-        focal: [V, 2], pixels.
-        centers: [V, 2], principal points, pixels.
-        half_widths: [V], pixels.
-    """
-
-    rotations: np.ndarray
-    translations: np.ndarray
-    focal: np.ndarray
-    centers: np.ndarray
-    half_widths: np.ndarray
+    rotations: np.ndarray  # [V, 3, 3], world to camera
+    translations: np.ndarray  # [V, 3]
+    focal: np.ndarray  # [V, 2], pixels
+    centers: np.ndarray  # [V, 2], principal points, pixels
+    half_widths: np.ndarray  # [V], pixels
 
     @classmethod
     def of(cls, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> Pinholes:
         """Cameras of viewmats [V, 4, 4], intrinsics [V, 3, 3] in pixels, and sizes [V, 2] (width, height)."""
         return cls(viewmats[:, :3, :3], viewmats[:, :3, 3], Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2], 0.5 * sizes[:, 0])
-
-    def where(self, kept: np.ndarray, others: Pinholes) -> Pinholes:
-        """Own cameras where `kept` [V] bool, the others elsewhere."""
-        pairs = ((getattr(self, field.name), getattr(others, field.name)) for field in fields(Pinholes))
-        return Pinholes(*(np.where(kept.reshape(-1, *[1] * (own.ndim - 1)), own, other) for own, other in pairs))
 
     def moved(self, by: np.ndarray, depths: np.ndarray) -> Pinholes:
         """The cameras after a step.
@@ -89,32 +78,18 @@ class Pinholes:
         """
         turns = _rotations(by[:, :3])
         translations = np.einsum("vij,vj->vi", turns, self.translations) + by[:, 3:6] * depths[:, None]
-        return replace(
-            self,
-            rotations=turns @ self.rotations,
-            translations=translations,
-            focal=self.focal * (1.0 + by[:, 6:8]),
-            centers=self.centers + by[:, 8:] * self.half_widths[:, None],
-        )
+        focal, centers = self.focal * (1.0 + by[:, 6:8]), self.centers + by[:, 8:] * self.half_widths[:, None]
+        return Pinholes(turns @ self.rotations, translations, focal, centers, self.half_widths)
 
 
-@dataclass(frozen=True)
-class Refinement:
-    """Cameras and points that agree better with one another.
-
-    Args:
-        cameras, points: of the same photos, and [M, 3].
-        spread: [PARAMETERS, PARAMETERS] covariance of how cameras differ from those that were given, in the units of
-            `Pinholes.moved`.
-        count: how many cameras are others than those that were given.
-        before, after: medians of `reprojection_errors`, in pixels.
-    """
+class Refinement(NamedTuple):
+    """Cameras and points that agree better with one another."""
 
     cameras: Pinholes
-    points: np.ndarray
-    spread: np.ndarray
-    count: int
-    before: float
+    points: np.ndarray  # [M, 3]
+    spread: np.ndarray  # [PARAMETERS, PARAMETERS], covariance of how far cameras have moved (`Pinholes.moved`)
+    count: int  # of cameras that are others than those that were given
+    before: float  # median of `reprojection_errors`, pixels
     after: float
 
     def text(self, called: str) -> str:
@@ -126,21 +101,14 @@ class Refinement:
 
 
 def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observations) -> Refinement:
-    """Cameras and points that agree better with one another.
-
-    Args:
-        cameras: as they were given.
-        points: [M, 3] float64.
-        observations: of these points by these cameras.
-    """
+    """Cameras and points [M, 3] float64 that agree better with one another, by observations of the points."""
     adjustment = _Adjustment(cameras, points, observations)
     for _ in range(ROUNDS):
         for _ in range(CAMERA_STEPS):
             adjustment.move_cameras()
             adjustment.learn_spread()
-        for _ in range(POINT_STEPS):
-            adjustment.move_points()
-    refined, moved = adjustment.agreeing_cameras(), adjustment.points
+        adjustment.move_points()
+    refined, moved = adjustment.agreeing_cameras(), np.ascontiguousarray(adjustment.places.T)
     count = int((refined.focal != cameras.focal).any(axis=1).sum())
     medians = (_median(adjustment.first_errors), _median(reprojection_errors(refined, moved, observations)))
     return Refinement(refined, moved, adjustment.spread, count, *medians)
@@ -149,12 +117,8 @@ def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observa
 def refine_alone(
     cameras: Pinholes, points: np.ndarray, observations: Observations, spread: np.ndarray | None = None
 ) -> Pinholes:
-    """Cameras that agree better with points, which stay.
-
-    Args:
-        cameras, points, observations: as in `refine_together`.
-        spread: of a `Refinement` of other photos of the capture; None: `PRIOR` of each parameter.
-    """
+    """Cameras that agree better with points, which stay. `spread`: of a `Refinement` of other photos of the capture;
+    None: `PRIOR` of each parameter."""
     adjustment = _Adjustment(cameras, points, observations, spread)
     for _ in range(RESECTION_STEPS):
         adjustment.move_cameras()
@@ -184,19 +148,7 @@ def of_these_photos(cameras: Pinholes, points: np.ndarray, observations: Observa
 
 class _Adjustment:
     """Cameras and points on their way. What observations have is coordinate by coordinate, [2, O] or [3, O]: a row is
-    read and written in one go.
-
-    Attributes:
-        places: [3, M], the points.
-        pixels: [2, O], where photos show them.
-        moves: [V, PARAMETERS], how far each camera has come.
-        spread: [PARAMETERS, PARAMETERS], the prior's covariance of these.
-        doubts: [V, PARAMETERS, PARAMETERS], the covariance of each camera's moves that is left by what the photo shows
-            and the prior; zero where the photo shows too little to be refined.
-        depths: [V], medians of the points before each camera.
-        first_errors: [O] pixels, before the first step.
-        scale: pixels, the median of these: errors far above it count little.
-    """
+    read and written in one go."""
 
     def __init__(
         self, cameras: Pinholes, points: np.ndarray, observations: Observations, spread: np.ndarray | None = None
@@ -205,25 +157,15 @@ class _Adjustment:
         views = len(cameras.focal)
         self.places, self.pixels = (np.array(rows.T, order="C") for rows in (points, observations.pixels))
         self.point_ids = observations.point_ids
-        self.starts = np.searchsorted(observations.view_ids, np.arange(views + 1))
-        self.moves = np.zeros((views, PARAMETERS))
-        self.spread = PRIOR**2 * np.eye(PARAMETERS) if spread is None else spread
+        starts = np.searchsorted(observations.view_ids, np.arange(views + 1))
+        self.own, self.counts = [slice(*ends) for ends in itertools.pairwise(starts.tolist())], np.diff(starts)
+        self.moves = np.zeros((views, PARAMETERS))  # how far each camera has come
+        self.spread = PRIOR**2 * np.eye(PARAMETERS) if spread is None else spread  # covariance of these in the prior
+        # Covariance of each camera's moves by what its photo shows and the prior; 0 where it shows too little.
         self.doubts = np.zeros((views, PARAMETERS, PARAMETERS))
-        sights, _, self.first_errors = self._seen()
-        self.depths = np.array([np.median(part) if len(part) else 1.0 for part in self._by_view(sights[2])])
-        self.scale = max(_median(self.first_errors), FINEST)
-
-    @property
-    def points(self) -> np.ndarray:
-        """[M, 3]."""
-        return np.ascontiguousarray(self.places.T)
-
-    def _by_view(self, values: np.ndarray) -> list[np.ndarray]:
-        return np.split(values, self.starts[1:-1])
-
-    def _parts(self) -> Iterator[tuple[int, slice]]:
-        """Each view, and the place of its observations among all."""
-        return ((view, slice(*own)) for view, own in enumerate(itertools.pairwise(self.starts.tolist())))
+        (*_, depths), _, self.first_errors = self._seen()
+        self.depths = np.array([np.median(depths[own]) if own.stop > own.start else 1.0 for own in self.own])
+        self.scale = max(_median(self.first_errors), FINEST)  # pixels; errors far above it count little
 
     def _seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The observations: x / z, y / z and z in the camera [3, O]; residuals [2, O]; their lengths [O], infinite
@@ -232,7 +174,7 @@ class _Adjustment:
         sights = np.take(self.places, self.point_ids, axis=1)
         residuals = np.empty((2, sights.shape[1]))
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
-            for view, own in self._parts():
+            for view, own in enumerate(self.own):
                 sights[:, own] = cameras.rotations[view] @ sights[:, own] + cameras.translations[view][:, None]
                 sights[:2, own] /= sights[2, own]
                 residuals[:, own] = sights[:2, own] * cameras.focal[view][:, None] + cameras.centers[view][:, None]
@@ -252,11 +194,18 @@ class _Adjustment:
         return sights, residuals, weights
 
     def move_cameras(self) -> None:
-        """One step of every camera."""
-        products, slopes = self._camera_sums()
-        factors, prior = self._camera_factors(), np.linalg.inv(self.spread)  # [V, 2, PARAMETERS, 9]
+        """One step of every camera, by sums over its observations of products of nine functions of the point with each
+        other and with the residuals: 1, p, q, pp, pq, qq, 1 / z, p / z and q / z, where p is x / z and q is y / z."""
+        (p, q, near), residuals, weights = self._counted()
+        roots = np.sqrt(weights)
+        functions = np.stack([np.ones_like(p), p, q, p * p, p * q, q * q, near, near * p, near * q])
+        functions *= roots
+        residuals *= roots
+        products = np.array([functions[:, own] @ functions[:, own].T for own in self.own])  # [V, 9, 9]
+        slopes = np.array([functions[:, own] @ residuals[:, own].T for own in self.own])  # [V, 9, 2]
+        factors, prior = self._camera_factors(), np.linalg.inv(self.spread)
         normals = (factors @ products[:, None] @ factors.swapaxes(2, 3)).sum(axis=1) + prior
-        told = np.diff(self.starts) >= FEWEST_OBSERVATIONS
+        told = self.counts >= FEWEST_OBSERVATIONS
         self.doubts[told] = np.linalg.inv(normals[told])
         right = np.einsum("vcai,vic->va", factors, slopes) - self.moves @ prior  # of the normal equations
         steps = np.einsum("vab,vb->va", self.doubts, right)
@@ -265,27 +214,13 @@ class _Adjustment:
 
     def _camera_factors(self) -> np.ndarray:
         """[V, 2, PARAMETERS, 9]: how x and y of a pixel change by each parameter of its camera, in factors of functions
-        of the point, listed at `_camera_sums`."""
+        of the point, listed at `move_cameras`."""
         factors = np.zeros((len(self.depths), 2, PARAMETERS, 9))
         for axis, (derivatives, focal) in enumerate(zip(DERIVATIVES, self.cameras.focal.T, strict=True)):
             for parameter, function, sign in derivatives:
                 factors[:, axis, parameter, function] = sign * focal * (self.depths if function >= 6 else 1.0)
             factors[:, axis, 8 + axis, 0] = self.cameras.half_widths
         return factors
-
-    def _camera_sums(self) -> tuple[np.ndarray, np.ndarray]:
-        """[V, 9, 9], [V, 9, 2]: of each view, weighted sums of products of nine functions with each other and with the
-        residuals. The functions are 1, p, q, pp, pq, qq, 1 / z, p / z and q / z, where p is x / z and q is y / z."""
-        (p, q, near), residuals, weights = self._counted()
-        roots = np.sqrt(weights)
-        functions = np.stack([np.ones_like(p), p, q, p * p, p * q, q * q, near, near * p, near * q])
-        functions *= roots
-        residuals *= roots
-        products, slopes = np.empty((len(self.depths), 9, 9)), np.empty((len(self.depths), 9, 2))
-        for view, own in self._parts():
-            products[view] = functions[:, own] @ functions[:, own].T
-            slopes[view] = functions[:, own] @ residuals[:, own].T
-        return products, slopes
 
     def learn_spread(self) -> None:
         """One step of expectation-maximisation of the prior."""
@@ -305,9 +240,21 @@ class _Adjustment:
             sums[[0, 3, 5]] += POINT_DAMPING
             self.places += np.where((seen >= 2) & (traces > 0), _solved(*sums), 0.0)
 
+    def _point_entries(self) -> np.ndarray:
+        """[9, O]: what each observation adds to its point's normal equations in the world: six entries of a symmetric
+        matrix and three of a vector."""
+        (p, q, near), (across, down), weights = self._counted()
+        weights *= near
+        across, down = across * weights, down * weights
+        weights *= near
+        functions = np.stack([weights, weights * p, weights * q, weights * p * p, weights * q * q, across, down,
+                              across * p, down * q])  # fmt: skip
+        for own, factors in zip(self.own, self._point_factors(), strict=True):
+            functions[:, own] = factors @ functions[:, own]
+        return functions
+
     def _point_factors(self) -> np.ndarray:
-        """[V, 9, 9]: six of a symmetric matrix and three of a vector, of a point's normal equations in the world, in
-        factors of functions of what a photo shows of it, listed at `_point_entries`."""
+        """[V, 9, 9]: these entries in factors of functions of what a photo shows of the point, listed above."""
         across, down, ahead = self.cameras.rotations.swapaxes(0, 1)  # [V, 3] each
         (fx, fy), (i, j) = self.cameras.focal.T[:, :, None], UPPER
         factors = np.zeros((len(fx), 9, 9))
@@ -319,24 +266,12 @@ class _Adjustment:
             factors[:, 6:, column + 6] = -focal * ahead
         return factors
 
-    def _point_entries(self) -> np.ndarray:
-        """[9, O]: what each observation adds to its point's normal equations."""
-        factors = self._point_factors()
-        (p, q, near), (across, down), weights = self._counted()
-        weights *= near
-        across, down = across * weights, down * weights
-        weights *= near
-        functions = np.stack([weights, weights * p, weights * q, weights * p * p, weights * q * q, across, down,
-                              across * p, down * q])  # fmt: skip
-        for view, own in self._parts():
-            functions[:, own] = factors[view] @ functions[:, own]
-        return functions
-
     def agreeing_cameras(self) -> Pinholes:
         """The cameras; the given one where its photo agrees no better."""
-        pairs = zip(self._by_view(self.first_errors), self._by_view(self._seen()[2]), strict=True)
-        better = np.array([len(new) > 0 and np.median(new) < np.median(old) for old, new in pairs])
-        return self.cameras.where(better, self.given)
+        old, new = self.first_errors, self._seen()[2]
+        better = np.array([own.stop > own.start and np.median(new[own]) < np.median(old[own]) for own in self.own])
+        pairs = zip(self.cameras, self.given, strict=True)
+        return Pinholes(*(np.where(better.reshape(-1, *[1] * (now.ndim - 1)), now, then) for now, then in pairs))
 
 
 def _solved(a, b, c, d, e, f, x, y, z) -> np.ndarray:
@@ -349,7 +284,66 @@ def _solved(a, b, c, d, e, f, x, y, z) -> np.ndarray:
 def _rotations(vectors: np.ndarray) -> np.ndarray:
     """[V, 3, 3] of rotation vectors [V, 3] (Rodrigues)."""
     angles = np.linalg.norm(vectors, axis=1)[:, None, None]
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    cross = np.cross(np.eye(3), vectors[:, None])  # `cross @ a` is the cross product with `a`
     return np.eye(3) + np.sinc(angles / np.pi) * cross + 0.5 * np.sinc(angles / (2 * np.pi)) ** 2 * (cross @ cross)
+
+
+class RefinedCameras(NamedTuple):
+    """Cameras and points of a scene by where its photos show its points."""
+
+    train: Cameras  # to train with
+    points: Tensor  # [M, 3] float32, to start from
+    test: Cameras  # of the test photos beside theirs
+    reprojection_error: float  # of the training cameras, as `Scene` has it
+    notes: tuple[str, ...]
+
+
+def find_cameras(scene: Scene, training: bool = True) -> RefinedCameras | None:
+    """Cameras that agree better with where photos show the scene's points; None where the capture does not say that, or
+    says it of other photos. Without `training`, training cameras and points stay, and only the test photos get cameras
+    beside theirs."""
+    places = scene.points.double().numpy()
+    given, tested = _pinholes(scene.train.cameras), _pinholes(scene.test.cameras)
+    shown, seen = scene.train.observations, scene.test.observations
+    if not (shown and seen and of_these_photos(given, places, shown) and of_these_photos(tested, places, seen)):
+        return None
+    together = refine_together(given, places, shown)
+    train, points, error = scene.train.cameras, scene.points, together.before
+    notes: tuple[str, ...] = ()
+    if training and together.count:
+        places, error, notes = together.points, together.after, (together.text("training cameras"),)
+        train, points = _cameras(together.cameras, train), torch.from_numpy(places).float()
+    beside = refine_alone(tested, places, seen, together.spread)
+    return RefinedCameras(train, points, _cameras(beside, scene.test.cameras), error, notes)
+
+
+def with_cameras(scene: Scene, found: RefinedCameras | None) -> Scene:
+    """The scene with these cameras; as it is where none were found."""
+    if found is None:
+        return scene
+    return replace(
+        scene,
+        train=replace(scene.train, cameras=found.train),
+        test=replace(scene.test, refined=found.test),
+        points=found.points,
+        reprojection_error=found.reprojection_error,
+        notes=(*scene.notes, *found.notes),
+    )
+
+
+def refine_cameras(scene: Scene, training: bool = True) -> Scene:
+    """The scene with the cameras of `find_cameras`, whose argument `training` is."""
+    return with_cameras(scene, find_cameras(scene, training))
+
+
+def _pinholes(cameras: Cameras) -> Pinholes:
+    """Cameras as float64 arrays."""
+    return Pinholes.of(cameras.viewmats.cpu().double().numpy(), cameras.Ks.cpu().double().numpy(), cameras.sizes)
+
+
+def _cameras(pinholes: Pinholes, like: Cameras) -> Cameras:
+    """The pinholes, of the images, type and device of other cameras."""
+    viewmats, Ks = (matrices.cpu().double().numpy().copy() for matrices in (like.viewmats, like.Ks))
+    viewmats[:, :3, :3], viewmats[:, :3, 3] = pinholes.rotations, pinholes.translations
+    Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2] = pinholes.focal, pinholes.centers
+    return Cameras(torch.from_numpy(viewmats).to(like.viewmats), torch.from_numpy(Ks).to(like.Ks), like.sizes)

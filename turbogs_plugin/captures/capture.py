@@ -10,23 +10,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from turbogs_plugin.captures.undistort import Lens
+from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.scene import Observations
 
-FEWEST_PHOTOS = 3
-"""Fewest photos of a capture."""
-
-LARGEST_SIDE = 65535
-"""Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
-
-LONGEST_NAME = 4096
-"""Most letters of a photo's name."""
-
+FEWEST_PHOTOS = 3  # fewest photos of a capture
+LONGEST_NAME = 4096  # most letters of a photo's name
 LARGEST_PIXEL = 1e9
 """Most pixels of a focal length or a principal point, and the reciprocal of the fewest: training uses float32."""
-
-AGAIN = "export or reconstruct it again"
 
 
 @dataclass
@@ -37,20 +28,18 @@ class Capture:
         names: V distinct names, ascending.
         photo_folder: photos of full size are ``photo_folder / name``; copies reduced by a factor may lie beside it, in
             a folder of the same name with ``_2``, ``_4``, ... appended.
-        viewmats: [V, 4, 4] float64, world to camera (x right, y down, z forward).
+        viewmats: [V, 4, 4] float64, world to camera (x right, y down, z forward); NaN where that is no rotation.
         Ks: [V, 3, 3] float64, intrinsics of the full-size photos, undistorted where they have a lens.
         sizes: [V, 2] int64 (width, height) of the full-size photos, undistorted where they have a lens.
         points: [M, 3] float64; M is 0 where `load_scene` is to draw them.
-        point_colors: [M, 3] uint8; None: the points were drawn at random, and their colours are taken from the photos
-            (`colors_in_photos`).
+        point_colors: [M, 3] uint8; None: points are random, and their colours are the photos' (`colors_in_photos`).
         lenses: one a view, None for a pinhole camera; given as empty where all are.
         notes: what the capture was taken for, and what was done with it: lines for the user.
         test: [V] bool, the test views of the capture's own split; None: views are split by their order.
-        alpha: what the alpha of a transparent photo is: the object's ``opacity``, so that the background shows through
-            and training makes the model as transparent; or a ``mask``, whose zero pixels are ignored.
+        alpha: what the alpha of a photo is: the object's ``opacity``, so that the background shows through and training
+            makes the model as transparent; or a ``mask``, whose zero pixels are ignored.
         mask_files: files of masks that the capture names, one a view or None; given as empty where it names none.
-        observations: where photos show the points, in pixels of the full-size photos, undistorted where they have a
-            lens; None: the capture does not say.
+        observations: where photos show the points, in pixels as `Ks` has them; None: the capture does not say.
         doubt: what may be wrong with the poses.
     """
 
@@ -80,21 +69,15 @@ class Capture:
         return np.array([size if lens is None else lens.photo_size for lens, size in both])
 
     def checked(self, source: Path) -> Capture:
-        """This capture without damaged views and points, which a note counts.
-
-        Raises:
-            InputError: no point is finite, or fewer than `FEWEST_PHOTOS` training views are whole.
-        """
+        """This capture without damaged views and points, which a note counts. Raises `InputError` where no point is
+        finite, or fewer than `FEWEST_PHOTOS` training views are whole."""
         if not self.names:
             raise InputError(f"{source} has no images with a pose: reconstruct the capture again")
-        orthogonality = self.viewmats[:, :3, :3] @ self.viewmats[:, :3, :3].transpose(0, 2, 1) - np.eye(3)
-        with np.errstate(invalid="ignore"):
-            posed = np.isfinite(self.viewmats).all(axis=(1, 2)) & (np.abs(orthogonality).max(axis=(1, 2)) < 1e-3)
-            posed &= np.linalg.det(np.nan_to_num(self.viewmats[:, :3, :3])) > 0
-        focal = self.Ks[:, [0, 1], [0, 1]]
-        lensed = (np.abs(self.Ks) < LARGEST_PIXEL).all(axis=(1, 2)) & (focal > 1.0 / LARGEST_PIXEL).all(axis=1)
+        posed = np.isfinite(self.viewmats).all(axis=(1, 2))
+        lensed = (np.abs(self.Ks) < LARGEST_PIXEL).all(axis=(1, 2))
+        lensed &= (self.Ks[:, [0, 1], [0, 1]] > 1.0 / LARGEST_PIXEL).all(axis=1)
         sized = ((self.sizes >= 1) & (self.sizes <= LARGEST_SIDE)).all(axis=1)
-        whole, notes = posed & lensed & sized, []
+        whole, finite, notes = posed & lensed & sized, np.isfinite(self.points).all(axis=1), []
         left = whole if self.test is None else whole & ~self.test
         for ok, trouble in (
             (posed, "a pose that is not a finite rotation and translation"),
@@ -102,19 +85,24 @@ class Capture:
             (sized, f"a size outside 1 .. {LARGEST_SIDE} pixels"),
         ):
             if not ok.all():
-                damage = f"'{self.names[int(np.argmin(ok))]}' has {trouble}"
+                count, damage = (~ok).sum(), f"'{self.names[ok.argmin()]}' has {trouble}"
                 if left.sum() < min(FEWEST_PHOTOS, len(self.names)):
-                    raise InputError(f"{source}: image {damage} ({(~ok).sum()} such images): {AGAIN}")
-                notes.append(f"{(~ok).sum()} of {len(self.names)} images are left out as damaged: {damage}")
-        finite = np.isfinite(self.points).all(axis=1)
+                    raise InputError(f"{source}: image {damage} ({count} such images): export or reconstruct it again")
+                notes.append(f"{count} of {len(self.names)} images are left out as damaged: {damage}")
         if not finite.all():
             if not finite.any():
-                raise InputError(f"{source}: none of {len(self.points)} 3D points is finite: {AGAIN}")
-            notes.append(f"{(~finite).sum()} of {len(self.points)} points are left out, as they are not finite")
+                raise InputError(f"{source}: none of {len(finite)} 3D points is finite: export or reconstruct it again")
+            notes.append(f"{(~finite).sum()} of {len(finite)} points are left out, as they are not finite")
         return self.subset(np.flatnonzero(whole), np.flatnonzero(finite), tuple(notes)) if notes else self
 
     def subset(self, views: np.ndarray, points: np.ndarray, notes: tuple[str, ...]) -> Capture:
         """Some views and points, both ascending, and more notes."""
+
+        def rows(name: str, kept: np.ndarray) -> Any:
+            if isinstance(values := getattr(self, name), tuple):
+                return tuple(values[row] for row in kept)
+            return None if values is None else values[kept]
+
         shown = self.observations
         if shown is not None:
             shown = shown.of_views(views, np.ones((len(views), 2)))
@@ -122,14 +110,9 @@ class Capture:
             there = points[places] == shown.point_ids
             shown = Observations(shown.pixels[there], shown.view_ids[there], places[there])
         per_view = ("names", "viewmats", "Ks", "sizes", "lenses", "test", "mask_files")
-        kept: dict[str, Any] = {name: _rows(getattr(self, name), views) for name in per_view}
-        kept |= {name: _rows(getattr(self, name), points) for name in ("points", "point_colors")}
+        kept: dict[str, Any] = {name: rows(name, views) for name in per_view}
+        kept |= {name: rows(name, points) for name in ("points", "point_colors")}
         return replace(self, notes=(*self.notes, *notes), observations=shown, **kept)
-
-
-def _rows(values: Any, rows: np.ndarray) -> Any:
-    """Some rows of an array or a tuple; None of None."""
-    return tuple(values[row] for row in rows) if isinstance(values, tuple) else None if values is None else values[rows]
 
 
 def bytes_of(path: Path) -> bytes:

@@ -12,18 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from turbogs_plugin.captures.capture import FEWEST_PHOTOS, LARGEST_SIDE, Capture, named, require_printable, text_of
-from turbogs_plugin.captures.colmap_files import (
-    CLOUD,
-    FILES,
-    FIRST_OF_CLOUD,
-    NO_POINT,
-    SUFFIXES,
-    ColmapModel,
-    ModelImage,
-    read_model,
-    read_poses,
-)
+from turbogs_plugin.captures import colmap_files
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, named, require_printable, text_of
+from turbogs_plugin.captures.colmap_files import CLOUD, FILES, ColmapModel, ModelImage, read_model
 from turbogs_plugin.captures.photo_files import IMAGES, find_named
 from turbogs_plugin.captures.starting_points import clouds_beside
 from turbogs_plugin.captures.undistort import Lens, lens_of_camera
@@ -39,10 +30,8 @@ TEST = "test.txt"
 
 
 def load_pycolmap() -> ModuleType:
-    """The module, loaded where it is used: other kinds of captures need neither its time nor its presence.
-
-    SIGTERM keeps the handler that Python knows of: pycolmap brings one that prints a trace of C++.
-    """
+    """The module, loaded where it is used: other captures need neither its time nor its presence. SIGTERM keeps the
+    handler that Python knows of: pycolmap brings one that prints a trace of C++."""
     import pycolmap
 
     if threading.current_thread() is threading.main_thread():
@@ -56,16 +45,16 @@ def find_model(scene: Path) -> tuple[Path, str] | None:
     Of the several that COLMAP writes where photos did not connect (``sparse/0``, ``sparse/1``, ...), the one with the
     largest file of images is taken. One that lacks files is taken where no other one is whole: `read_model` names them.
     """
+
+    def bytes_of_images(model: tuple[Path, str]) -> int:
+        file = model[0] / f"images{model[1]}"
+        return file.stat().st_size if file.is_file() else 0
+
     for needed in (FILES, FILES[:1], FILES[1:2]):
         for name in MODEL_FOLDERS:
             if models := _models_in(scene / name, needed):
-                return max(models, key=lambda model: _images_bytes(*model))  # first of equals
+                return max(models, key=bytes_of_images)  # first of equals
     return None
-
-
-def _images_bytes(folder: Path, suffix: str) -> int:
-    file = folder / f"images{suffix}"
-    return file.stat().st_size if file.is_file() else 0
 
 
 def _models_in(place: Path, needed: Sequence[str]) -> list[tuple[Path, str]]:
@@ -73,56 +62,50 @@ def _models_in(place: Path, needed: Sequence[str]) -> list[tuple[Path, str]]:
     suffixes. `needed` are the files that they have."""
     folders = [folder for folder in place.glob("[0-9]*") if re.fullmatch("[0-9]{1,9}", folder.name)]
     folders = [*sorted(folders, key=lambda folder: (int(folder.name), folder.name)), place]
-    pairs = [(folder, suffix) for folder in folders for suffix in SUFFIXES]
+    pairs = [(folder, suffix) for folder in folders for suffix in colmap_files.SUFFIXES]
     return [(folder, suffix) for folder, suffix in pairs if all((folder / f"{f}{suffix}").is_file() for f in needed)]
 
 
 def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
-    """Read a reconstruction. Its photos are found by `find_named`; images whose photo does not exist are left out.
-
-    Args:
-        scene: the scene's folder.
-        folder, suffix: as `find_model` gives them.
-
-    Raises:
-        InputError: files that are damaged or inconsistent, a camera that no pinhole can take the place of, or fewer
-            than `FEWEST_PHOTOS` photos.
-    """
+    """Read a reconstruction that `find_model` has found, without images whose photo does not exist (`find_named`).
+    Raises `InputError` for files that are damaged or inconsistent, a camera that no pinhole can take the place of, or
+    fewer than `FEWEST_PHOTOS` photos."""
     load_pycolmap()
     model = read_model(folder, suffix)
     found = find_named(scene, [image.name for image in model.images], folder, (IMAGES, ""))
     images = [model.images[place] for place in found.places]
-    lenses = {image.camera: _lens(model.cameras[image.camera], folder) for image in images}
-    poses, doubt = read_poses(folder, suffix, model)
+    ids = {image.camera for image in images}
+    lenses = {id: lens_of_camera(model.cameras[id], f"camera {id} of {folder}") for id in ids}
     pairs = [(model.cameras[image.camera], lenses[image.camera]) for image in images]
-    viewmats = np.array([poses[image.number] for image in images]).reshape(-1, 4, 4)
-    Ks = np.array([camera.calibration_matrix() if lens is None else lens.K for camera, lens in pairs]).reshape(-1, 3, 3)
-    sizes = np.array([(camera.width, camera.height) if lens is None else lens.size for camera, lens in pairs])
-    sizes = sizes.reshape(-1, 2).astype(np.int64)
+    Ks = [camera.calibration_matrix() if lens is None else lens.K for camera, lens in pairs]
+    sizes = [(camera.width, camera.height) if lens is None else lens.size for camera, lens in pairs]
     where = "" if found.folder == scene / IMAGES else f", photos in {found.folder}"
-    kind = {".bin": "binary", ".txt": "text"}[suffix]
-    cloud = folder / CLOUD if len(model.points) and model.points["id"][0] >= FIRST_OF_CLOUD else None
+    kind = "binary" if suffix == ".bin" else "text"
+    cloud = folder / CLOUD if len(model.points) and model.points["id"][0] >= colmap_files.FIRST_OF_CLOUD else None
     test, split = _own_split(scene, folder, found.names)
+    beside = [other for other, _ in _models_in(folder.parent, FILES)]
+    unused = named([other.name for other in beside if other != folder])
+    choice = f"{len(beside)} reconstructions in {folder.parent}: {folder.name} is taken, the largest; {unused} not used"
     return Capture(
         names=found.names,
         photo_folder=found.folder,
-        viewmats=viewmats,
-        Ks=Ks,
-        sizes=sizes,
+        viewmats=np.array([image.viewmat for image in images]).reshape(-1, 4, 4),
+        Ks=np.array(Ks).reshape(-1, 3, 3),
+        sizes=np.array(sizes, dtype=np.int64).reshape(-1, 2),
         points=model.points["xyz"].copy(),
         point_colors=model.points["color"].copy(),
         lenses=tuple(lens for _, lens in pairs),
         notes=(
             f"COLMAP reconstruction {folder} ({kind}): {len(images)} images, {len(model.points):,} points"
             f"{f' of {CLOUD}' if cloud else ''}{where}{split}",
-            *_choice_note(folder),
+            *([choice] if folder in beside and unused else []),
             *found.notes,
             *clouds_beside([folder, scene], cloud, f"{CLOUD} is, in a model without points3D"),
-            *([doubt] if doubt else []),
+            *filter(None, [model.doubt]),
         ),
         test=test,
         alpha="mask",
-        doubt=doubt,
+        doubt=model.doubt,
         observations=_observations(model, images, lenses) if len(model.points) else None,
     ).checked(folder)
 
@@ -130,45 +113,23 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
 def _own_split(scene: Path, folder: Path, names: Sequence[str]) -> tuple[np.ndarray | None, str]:
     """[V] bool: the photos that a ``test.txt`` lists, a name a line with suffix or without (Inria's), and words; None
     where there is none, or where it leaves too few for training."""
-    for file in (folder / TEST, folder.parent / TEST, scene / TEST):
-        if file.is_file():
-            listed = {line.strip().removeprefix(f"{IMAGES}/") for line in text_of(file).split("\n")}
-            test = np.array([not listed.isdisjoint({name, str(Path(name).with_suffix(""))}) for name in names])
-            if test.any() and (~test).sum() >= FEWEST_PHOTOS:
-                return test, f", by {file.name} {(~test).sum()} for training, {test.sum()} for testing"
-            return None, f", {file} not used: {test.sum()} of its names have a photo"
-    return None, ""
-
-
-def _choice_note(model: Path) -> list[str]:
-    """Which of several reconstructions was taken, where there are several."""
-    models = _models_in(model.parent, FILES)
-    if len(models) < 2 or model not in [folder for folder, _ in models]:
-        return []
-    others = named([folder.name for folder, _ in models if folder != model])
-    return [f"{len(models)} reconstructions in {model.parent}: {model.name} is taken, the largest; {others} not used"]
-
-
-def _lens(camera: pycolmap.Camera, model: Path) -> Lens | None:
-    """The lens of a camera; None for a pinhole, and for an impossible size, which `Capture.checked` refuses."""
-    if max(camera.width, camera.height) > LARGEST_SIDE:
-        return None
-    return lens_of_camera(camera, f"camera {camera.camera_id} of {model}")
+    file = next((place / TEST for place in (folder, folder.parent, scene) if (place / TEST).is_file()), None)
+    if file is None:
+        return None, ""
+    listed = {line.strip().removeprefix(f"{IMAGES}/") for line in text_of(file).split("\n")}
+    test = np.array([not listed.isdisjoint({name, str(Path(name).with_suffix(""))}) for name in names])
+    if test.any() and (~test).sum() >= FEWEST_PHOTOS:
+        return test, f", by {file.name} {(~test).sum()} for training, {test.sum()} for testing"
+    return None, f", {file} not used: {test.sum()} of its names have a photo"
 
 
 def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict[int, Lens | None]) -> Observations:
-    """Places where images show points, in pixels of their pinhole cameras.
-
-    Features whose point is not there are left out.
-
-    Args:
-        images: the views, in their order.
-        lenses: camera's identifier -> its lens; None for a pinhole.
-    """
+    """Places where images, the views, show points that are there, in pixels of their pinhole cameras. `lenses`: by the
+    cameras' identifiers, None for a pinhole."""
     ids = model.points["id"]
     parts = [(np.zeros((0, 2)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
     for view, image in enumerate(images):
-        shown = image.features[image.features["point"] != NO_POINT]
+        shown = image.features[image.features["point"] != colmap_files.NO_POINT]
         points = np.searchsorted(ids, shown["point"])
         pixels, lens = shown["pixel"].astype(np.float64), lenses[image.camera]
         if lens is not None and len(pixels):
@@ -179,11 +140,8 @@ def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict
 
 
 def read_reconstruction(folder: Path, suffix: str) -> pycolmap.Reconstruction:
-    """The reconstruction as pycolmap reads it, with whole names.
-
-    Raises:
-        InputError: pycolmap cannot read it, or a name cannot be printed.
-    """
+    """The reconstruction as pycolmap reads it, with whole names. Raises `InputError` where it cannot, or where a name
+    cannot be printed."""
     reconstruction = load_pycolmap().Reconstruction()
     try:
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(folder)
@@ -198,13 +156,7 @@ def read_reconstruction(folder: Path, suffix: str) -> pycolmap.Reconstruction:
 
 def write_whole(reconstruction: pycolmap.Reconstruction, folder: Path, called: Path) -> None:
     """Write the binary files of a reconstruction, and see that they are whole: of a full disk pycolmap says nothing.
-
-    Args:
-        called: the folder's name in the message.
-
-    Raises:
-        InputError: the files are not whole.
-    """
+    Raises `InputError` where they are not; `called` is the folder's name in its line."""
     try:
         reconstruction.write_binary(folder)
         read_model(folder, ".bin")

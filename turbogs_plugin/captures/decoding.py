@@ -19,8 +19,6 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.host_arrays import host_array
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 
-MODES = {3: "RGB", 4: "RGBa"}
-"""Pillow's modes, by channels; the latter's colours are multiplied by alpha."""
 SMALLEST_SIDE = 4
 """The shorter side of a reduced photo has at least this many pixels; of fewer, nothing is left to see."""
 OPAQUE_SUFFIXES = (".jpg", ".jpeg")
@@ -50,19 +48,14 @@ MOST_THREADS = 16
 
 
 def reduced_sizes(sizes: np.ndarray, factor: float) -> np.ndarray:
-    """[V, 2] int64: sizes divided by `factor`, to the nearest pixel.
-
-    Raises:
-        InputError: the factor leaves a side of less than `SMALLEST_SIDE`.
-    """
+    """[V, 2] int64: sizes divided by `factor`, to the nearest pixel. Raises `InputError` where the factor leaves a side
+    of less than `SMALLEST_SIDE`."""
     reduced = np.floor(sizes / factor + 0.5).astype(np.int64)
     if factor > 1 and reduced.min() < SMALLEST_SIDE:
         width, height = sizes[sizes.min(axis=1).argmin()].tolist()
         largest = max(1, int(min(width, height) / (SMALLEST_SIDE - 0.5)))
-        raise InputError(
-            f"--factor {factor:g} leaves too little of photos of {width}x{height}: the largest that keeps "
-            f"{SMALLEST_SIDE} pixels a side is {largest}"
-        )
+        remedy = f"the largest that keeps {SMALLEST_SIDE} pixels a side is {largest}"
+        raise InputError(f"--factor {factor:g} leaves too little of photos of {width}x{height}: {remedy}")
     return reduced
 
 
@@ -90,9 +83,8 @@ def channels_of(paths: Sequence[Path]) -> int:
         with opened_image(path) as image:
             return is_transparent(image)
 
-    candidates = [path for path in paths if path.suffix.lower() not in OPAQUE_SUFFIXES]
     with decoding_threads() as pool:
-        return 4 if any(pool.map(transparent, candidates)) else 3
+        return 4 if any(pool.map(transparent, (p for p in paths if p.suffix.lower() not in OPAQUE_SUFFIXES))) else 3
 
 
 def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
@@ -108,12 +100,10 @@ def load_photos(
     channels: int = 3,
     progress: Callable[[int, int], object] | None = None,
 ) -> Photos:
-    """Decode photos in parallel, undistorted, then reduced to their target sizes by area averaging.
-
-    Photos are taken as stored: an orientation in EXIF is ignored, as COLMAP does.
+    """Decode V photos in parallel, undistorted, then reduced to their target sizes by area averaging. They are taken as
+    stored: an orientation in EXIF is ignored, as COLMAP does.
 
     Args:
-        paths: V files.
         targets: [V, 2] int64 (width, height) to give them.
         lenses: one a photo, None for a pinhole camera.
         channels: 3, where photos that are transparent lose their alpha and keep their colours as stored; or 4, where
@@ -121,18 +111,23 @@ def load_photos(
         progress: called with the number of photos decoded so far, and of all.
 
     Raises:
-        InputError: a photo that cannot be decoded (the first one in order is named); more photos than fit in memory or
-            on the disk.
+        InputError: a photo that cannot be decoded, the first one in order; more photos than fit in memory or on disk.
     """
-    offsets = pixel_offsets(targets)
-    colors = _room(targets, channels)
+    # Pillow's mode with an a has colours that are multiplied by alpha.
+    offsets, mode = pixel_offsets(targets), "RGBa" if channels == 4 else "RGB"
+
+    def room(channels: int) -> Tensor:
+        """[X, channels] uint8, with any content."""
+        return host_array((int(offsets[-1]), channels), torch.uint8, f"{len(targets)} photos")
+
+    colors = room(channels)
     pixels = colors.numpy()
 
     def load(view: int) -> bool:
         """Decode a photo; True where it is opaque."""
-        target = tuple(targets[view].tolist())
-        photo = _decode(paths[view], MODES[channels])
-        lens = lenses[view]
+        target, lens = tuple(targets[view].tolist()), lenses[view]
+        with opened_image(paths[view]) as image:
+            photo = (image.convert("RGBA") if channels == 4 or is_transparent(image) else image).convert(mode)
         if lens is not None:
             photo = lens.undistort(photo)
         if photo.size != target:
@@ -148,13 +143,8 @@ def load_photos(
             if progress is not None:
                 progress(count, len(paths))
     if opaque and channels == 4:
-        colors = _room(targets, 3).copy_(colors[:, :3])
+        colors = room(3).copy_(colors[:, :3])
     return Photos(colors, targets)
-
-
-def _room(sizes: np.ndarray, channels: int) -> Tensor:
-    """[X, channels] uint8 for photos of these `sizes` [V, 2], with any content."""
-    return host_array((int(pixel_offsets(sizes)[-1]), channels), torch.uint8, f"{len(sizes)} photos")
 
 
 def decoding_threads() -> ThreadPoolExecutor:
@@ -162,55 +152,32 @@ def decoding_threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, min(MOST_THREADS, processor_cores())))
 
 
-def _decode(path: Path, mode: str) -> Image.Image:
-    """An image of exactly this mode, or `InputError`."""
-    with opened_image(path) as image:
-        if mode == "RGBa" or is_transparent(image):
-            image = image.convert("RGBA")
-        return image.convert(mode)
-
-
 @contextmanager
 def opened_image(
     path: Path, what: str = "photo", remedy: str = "copy it there again", pixels: int = ALWAYS_PIXELS
 ) -> Iterator[Image.Image]:
     """The file with its header read, as stored; `InputError` for whatever goes wrong with it while entered, for more
-    pixels than its bytes may have, and for a TIFF that Pillow would turn, as it turns no other kind: cameras are by the
-    pixels as they are stored.
-
-    Args:
-        pixels: number that the image may have whatever the file's bytes.
-    """
+    pixels than its bytes may have (`pixels` are allowed whatever they are), and for a TIFF that Pillow would turn, as
+    it turns no other kind: cameras are by the pixels as they are stored."""
     other = OTHER_FORMATS.get(path.suffix.lower())
     try:
         with Image.open(path, formats=(*FORMATS, other) if other else FORMATS) as image:
             stored = path.stat().st_size
             if image.width * image.height > max(pixels, PIXELS_A_BYTE * stored):
-                raise InputError(
-                    f"{what} {path} has {image.width}x{image.height} pixels in {stored} bytes, which no {what} has: "
-                    "replace it or take it out"
-                )
+                size = f"{image.width}x{image.height} pixels in {stored} bytes"
+                raise InputError(f"{what} {path} has {size}, which no {what} has: replace it or take it out")
             if image.format == "TIFF" and image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
-                raise InputError(
-                    f"{what} {path} is a TIFF with an orientation in its EXIF data: take that out, or save it upright "
-                    "before cameras are found"
-                )
+                upright = "take that out, or save it upright before cameras are found"
+                raise InputError(f"{what} {path} is a TIFF with an orientation in its EXIF data: {upright}")
             yield image
     except InputError:
         raise
     except Exception as error:  # a broken file can raise anything in its decoder
         reason = " ".join((getattr(error, "strerror", None) or str(error) or type(error).__name__).split())
         if isinstance(error, UnidentifiedImageError):
-            reason, remedy = _what_it_is(path, remedy)
+            with path.open("rb") as file:
+                start = file.read(64)
+            known = (said for form, *said in KINDS if re.match(form, start, re.DOTALL | re.IGNORECASE))
+            kind, remedy = next(known, ["no image of a known kind", remedy])
+            reason = f"it is {kind}" if start else "the file is empty"
         raise InputError(f"cannot read the {what} {path}: {reason}; {remedy}") from error
-
-
-def _what_it_is(path: Path, remedy: str) -> tuple[str, str]:
-    """What a file is that Pillow does not know, by its first bytes, and what to do; `remedy` where nothing is known."""
-    with path.open("rb") as file:
-        start = file.read(64)
-    if not start:
-        return "the file is empty", remedy
-    known = (said for form, *said in KINDS if re.match(form, start, re.DOTALL | re.IGNORECASE))
-    kind, advice = next(known, ["no image of a known kind", remedy])
-    return f"it is {kind}", advice

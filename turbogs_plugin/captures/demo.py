@@ -25,16 +25,13 @@ if TYPE_CHECKING:
 
 Texture = Callable[[np.ndarray], np.ndarray]
 """[R, 3] points in the solid's own coordinates -> [R, 3] colours, 0 .. 1."""
-
 RAYS_PER_SIDE = 3
 """Each pixel is the mean of this many rays squared. Odd, so that one goes through its centre."""
 LIGHT = np.array([0.45, -0.25, 0.86], dtype=np.float32)
 AMBIENT = 0.55
 ORBIT_RADIUS, ORBIT_HEIGHT, ORBIT_SWING = 3.6, 1.9, 0.5
-LOOK_AT = 0.25
-"""Height of what the cameras look at, above the middle of the table."""
-FOCAL = 1.15
-"""Focal length in image widths: 47 degrees across."""
+LOOK_AT = 0.25  # height of what the cameras look at, above the middle of the table
+FOCAL = 1.15  # focal length in image widths: 47 degrees across
 POINT_NOISE = 0.004
 """Standard deviation of the noise on the reconstruction's points; solids are about 1 across."""
 POINTS_PER_VIEW = 150
@@ -43,22 +40,13 @@ PHOTO_NAME = "view_{:03d}.png"
 
 @dataclass
 class Solid:
-    """A solid on the vertical axis of its own coordinates, placed by a turn about it and a translation.
+    """A solid on the vertical axis of its own coordinates. In these, `intersect` gives distances [R] along rays from
+    `origin` [3] in `directions` [R, 3], infinite where they miss it; `normal`, outward unit normals [R, 3] at points."""
 
-    In own coordinates, `intersect` gives distances [R] along rays from `origin` [3] in `directions` [R, 3], infinite
-    where they miss it, and `normal` outward unit normals [R, 3] at surface points.
-
-    Args:
-        size: radius, or of a box half of each side [3].
-        texture: colours of surface points.
-        position: [3].
-        turn: radians.
-    """
-
-    size: float | np.ndarray
+    size: float | np.ndarray  # radius, or half of each side of a box [3]
     texture: Texture
-    position: np.ndarray
-    turn: float = 0.0
+    position: np.ndarray  # [3], of its origin in the world
+    turn: float  # about the axis, radians
 
     @property
     def rotation(self) -> np.ndarray:
@@ -102,11 +90,8 @@ class Disc(Solid):
 
 
 def checker(size: float, first: np.ndarray, second: np.ndarray) -> Texture:
-    def colors(points: np.ndarray) -> np.ndarray:
-        odd = np.floor(points / size + 0.25).sum(axis=1) % 2 > 0.5
-        return np.where(odd[:, None], first, second)
-
-    return colors
+    """Cubes of two colours in turn."""
+    return lambda points: np.where((np.floor(points / size + 0.25).sum(axis=1) % 2 > 0.5)[:, None], first, second)
 
 
 def noise(size: float, first: np.ndarray, second: np.ndarray, random: np.random.Generator) -> Texture:
@@ -121,9 +106,11 @@ def noise(size: float, first: np.ndarray, second: np.ndarray, random: np.random.
     return colors
 
 
-def demo_solids(random: np.random.Generator) -> list[Sphere | Box | Disc]:
-    """Five solids on a round table; colours, textures and turns are drawn from `random`."""
+Solids = list[Sphere | Box | Disc]
 
+
+def demo_solids(random: np.random.Generator) -> Solids:
+    """Five solids on a round table; colours, textures and turns are drawn from `random`."""
     turn, vector = partial(random.uniform, 0, np.pi), partial(np.array, dtype=np.float32)
 
     def color() -> np.ndarray:
@@ -142,132 +129,91 @@ def demo_solids(random: np.random.Generator) -> list[Sphere | Box | Disc]:
     ]
 
 
-def cast(
-    solids: list[Sphere | Box | Disc], origin: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def cast(solids: Solids, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[R, 3] colours and [R] distances of what rays see; black at infinity where they see nothing."""
-    nearest = np.full(len(directions), np.inf, dtype=np.float32)
-    owner = np.full(len(directions), -1)
-    for number, solid in enumerate(solids):
-        distances = solid.intersect((origin - solid.position) @ solid.rotation, directions @ solid.rotation)
-        closer = distances < nearest
-        nearest[closer], owner[closer] = distances[closer], number
+    local = [(solid, (origin - solid.position) @ solid.rotation, directions @ solid.rotation) for solid in solids]
+    hits = [solid.intersect(*rays) for solid, *rays in local]  # [S, R]
+    nearest, owner = np.min(hits, axis=0).astype(np.float32), np.argmin(hits, axis=0)
     colors = np.zeros((len(directions), 3), dtype=np.float32)
     for number, solid in enumerate(solids):
-        rays = np.flatnonzero(owner == number)
+        rays = np.flatnonzero((owner == number) & np.isfinite(nearest))
         points = (origin + nearest[rays, None] * directions[rays] - solid.position) @ solid.rotation
         light = np.maximum(solid.normal(points) @ solid.rotation.T @ LIGHT, 0.0)
         colors[rays] = solid.texture(points) * (AMBIENT + (1.0 - AMBIENT) * light)[:, None]
     return colors, nearest
 
 
-def orbit_pose(angle: float) -> np.ndarray:
-    """[3, 4] float64 world to camera, on a ring about the table that swings in height."""
-    center = np.array(
-        [ORBIT_RADIUS * np.cos(angle), ORBIT_RADIUS * np.sin(angle), ORBIT_HEIGHT + ORBIT_SWING * np.sin(3 * angle)]
-    )
-    return look_at(center, target=np.array([0.0, 0.0, LOOK_AT]), up=np.array([0.0, 0.0, 1.0]))[:3]
-
-
 def write_demo_capture(path: str | Path, seed: int = 0, views: int = 32, width: int = 160, height: int = 120) -> Path:
-    """Write the demo capture to the new folder `path`: ``images/*.png`` and ``sparse/0``.
-
-    The same arguments give the same pixels, cameras and points.
-
-    Raises:
-        InputError: `path` is there already, or cannot be written; or fewer than 3 views or an image without area are
-            asked for. Then nothing is written.
-    """
+    """Write the demo capture to the new folder `path`: ``images/*.png`` and ``sparse/0``, the same for the same
+    arguments. Raises `InputError`, and writes nothing, where `path` is there already or cannot be written, or fewer
+    than 3 views or an image without area are asked for."""
     target = Path(path)
     if target.exists():
         raise InputError(f"{target} is there already: choose a new folder for the demo capture")
     if views < 3 or width < 1 or height < 1:
         raise InputError(f"the demo capture was asked for {views} views of {width}x{height}: at least 3 of 1x1 needed")
-    reconstruction = load_pycolmap().Reconstruction()  # where the package is absent, or another one, that is said first
+    load_pycolmap()  # where the package is absent, or another one, that is said first
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".") as temporary:
         capture = Path(temporary) / "capture"
-        model = capture / "sparse" / "0"
-        (capture / "images").mkdir(parents=True)
-        model.mkdir(parents=True)
-        random = np.random.default_rng(seed)
-        poses = np.stack([orbit_pose(2 * np.pi * view / views) for view in range(views)])  # [V, 3, 4]
-        seen = _photograph(capture / "images", random, poses, width, height)
-        _fill(reconstruction, poses, *seen, FOCAL * width, random)
-        write_whole(reconstruction, model, target)
+        for folder in ("images", "sparse/0"):
+            (capture / folder).mkdir(parents=True)
+        write_whole(_photographed(capture / "images", seed, views, width, height), capture / "sparse/0", target)
         capture.rename(target)
     return target
 
 
-def _photograph(
-    folder: Path, random: np.random.Generator, poses: np.ndarray, width: int, height: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Write the photos of cameras [V, 3, 4].
-
-    Returns:
-        [M, 3] points on surfaces; [M, 3] their colours, 0 .. 1; [V, H, W] depths of the pixels' centres, infinite where
-        there is nothing.
-    """
-    solids, side = demo_solids(random), RAYS_PER_SIDE
+def _photographed(folder: Path, seed: int, views: int, width: int, height: int) -> pycolmap.Reconstruction:
+    """Write the photos, whose cameras stand on a ring about the table that swings in height; and what COLMAP would have
+    made of them."""
+    random, side, focal = np.random.default_rng(seed), RAYS_PER_SIDE, FOCAL * width
+    angles, poses = 2 * np.pi * np.arange(views) / views, np.empty((views, 3, 4))
+    for view, angle in enumerate(angles):
+        ring = ORBIT_RADIUS * np.array([np.cos(angle), np.sin(angle)])
+        at = np.array([*ring, ORBIT_HEIGHT + ORBIT_SWING * np.sin(3 * angle)])
+        poses[view] = look_at(at, target=np.array([0.0, 0.0, LOOK_AT]), up=np.array([0.0, 0.0, 1.0]))[:3]
+    solids = demo_solids(random)
     x, y = np.meshgrid((np.arange(width * side) + 0.5) / side, (np.arange(height * side) + 0.5) / side)
-    focal = FOCAL * width
     rays = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)], axis=-1)
-    depths = np.empty((len(poses), height, width), dtype=np.float32)
-    points, point_colors = [], []
+    depths = np.empty((views, height, width), dtype=np.float32)  # of pixels' centres; infinite where there is nothing
+    chosen_points, chosen_colors = [], []
     for view, pose in enumerate(poses):
         origin = (-pose[:, :3].T @ pose[:, 3]).astype(np.float32)
         directions = (rays.reshape(-1, 3) @ pose[:, :3]).astype(np.float32)
         lengths = np.linalg.norm(directions, axis=1, keepdims=True)
         directions /= lengths
-        colors, distances = cast(solids, origin, directions)
-        pixels = colors.reshape(height, side, width, side, 3).mean(axis=(1, 3))
+        seen, distances = cast(solids, origin, directions)
+        pixels = seen.reshape(height, side, width, side, 3).mean(axis=(1, 3))
         Image.fromarray(np.round(pixels * 255).astype(np.uint8)).save(folder / PHOTO_NAME.format(view))
         centers = np.s_[side // 2 :: side, side // 2 :: side]
         depths[view] = (distances[:, None] / lengths).reshape(height * side, width * side)[centers]
         hits = np.flatnonzero(np.isfinite(distances))
         chosen = random.choice(hits, min(POINTS_PER_VIEW, len(hits)), replace=False)
-        points.append(origin + distances[chosen, None] * directions[chosen])
-        point_colors.append(colors[chosen])
-    return np.concatenate(points), np.concatenate(point_colors), depths
+        chosen_points.append(origin + distances[chosen, None] * directions[chosen])
+        chosen_colors.append(seen[chosen])
+    points, colors = np.concatenate(chosen_points), np.concatenate(chosen_colors)  # [M, 3] on surfaces
 
-
-def _fill(
-    reconstruction: pycolmap.Reconstruction,
-    poses: np.ndarray,
-    points: np.ndarray,
-    colors: np.ndarray,
-    depths: np.ndarray,
-    focal: float,
-    random: np.random.Generator,
-) -> None:
-    """Make an empty reconstruction what COLMAP would have made of the photos.
-
-    Args:
-        poses: [V, 3, 4] world to camera.
-        points, colors, depths: as `_photograph` returns them.
-        focal: pixels.
-    """
-    views, height, width = depths.shape
     local = np.einsum("vij,mj->vmi", poses[:, :, :3], points) + poses[:, None, :, 3]  # [V, M, 3]
-    pixels = local[..., :2] / local[..., 2:] * focal + [width / 2, height / 2]  # [V, M, 2]
-    columns, rows = np.floor(pixels).astype(int).transpose(2, 0, 1)
+    places = local[..., :2] / local[..., 2:] * focal + [width / 2, height / 2]  # [V, M, 2]
+    columns, rows = np.floor(places).astype(int).transpose(2, 0, 1)
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    seen_depths = depths[np.arange(views)[:, None], rows.clip(0, height - 1), columns.clip(0, width - 1)]
-    visible = inside & (np.abs(local[..., 2] - seen_depths) < 0.02 * seen_depths)  # [V, M]
+    there = depths[np.arange(views)[:, None], rows.clip(0, height - 1), columns.clip(0, width - 1)]
+    visible = inside & (np.abs(local[..., 2] - there) < 0.02 * there)  # [V, M]
     visible &= visible.sum(axis=0) >= 2
+    numbers = np.cumsum(visible, axis=1) - 1  # [V, M] of a point among the points of its view
 
     pycolmap = load_pycolmap()
-    params = [focal, focal, width / 2, height / 2]
+    reconstruction, params = pycolmap.Reconstruction(), [focal, focal, width / 2, height / 2]
     camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=width, height=height, params=params)
     reconstruction.add_camera_with_trivial_rig(camera)
-    positions = np.cumsum(visible, axis=1) - 1  # [V, M] number of a point among the points of its view
-    for view in range(views):
-        name = PHOTO_NAME.format(view)
-        image = pycolmap.Image(name, keypoints=pixels[view, visible[view]], camera_id=1, image_id=view + 1)
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(poses[view]))
+    for view, pose in enumerate(poses):
+        keypoints = places[view, visible[view]]
+        image = pycolmap.Image(PHOTO_NAME.format(view), keypoints=keypoints, camera_id=1, image_id=view + 1)
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
     displaced = points + random.normal(scale=POINT_NOISE, size=points.shape)
     for point in np.flatnonzero(visible.any(axis=0)):
         seen_by = np.flatnonzero(visible[:, point])
-        track = pycolmap.Track([pycolmap.TrackElement(view + 1, positions[view, point]) for view in seen_by])
+        track = pycolmap.Track([pycolmap.TrackElement(view + 1, numbers[view, point]) for view in seen_by])
         reconstruction.add_point3D(displaced[point], track, np.round(colors[point] * 255).astype(np.uint8))
     reconstruction.update_point_3d_errors()
+    return reconstruction

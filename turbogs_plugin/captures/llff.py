@@ -13,22 +13,18 @@ import numpy as np
 
 from turbogs_plugin.captures.capture import Capture, require_printable
 from turbogs_plugin.captures.photo_files import IMAGES, NAMED_SUFFIXES, REDUCED, maps_beside, unread
-from turbogs_plugin.captures.starting_points import NUM_RANDOM_POINTS, clouds_beside, points_in_views
+from turbogs_plugin.captures.starting_points import clouds_beside, points_in_views
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import viewmat_of_pose
 
 FILE = "poses_bounds.npy"
-COLUMNS = 17
 AGAIN = "write it again with LLFF's imgs2poses.py"
 
 
 def read_llff(scene: Path) -> Capture:
     """Read a capture, with the largest photos that are there. There are no points: they are drawn within the views,
-    between the bounds of depth.
-
-    Raises:
-        InputError: a file of another shape, poses or bounds that make no sense, another number of photos.
-    """
+    between the bounds of depth. Raises `InputError` for a file of another shape, poses or bounds that make no sense,
+    another number of photos."""
     source = scene / FILE
     table = _read_table(source)
     matrices, bounds = table[:, :15].reshape(-1, 3, 5), table[:, 15:]
@@ -41,10 +37,9 @@ def read_llff(scene: Path) -> Capture:
             f"{source} has {len(table)} poses but {folder} has {len(names)} photos: bring back those that are missing, "
             f"take out those without a pose, or {AGAIN}{f' ({unread(folder)})' if unread(folder) else ''}"
         )
-    for name in names:
-        require_printable(name, folder)
     viewmats = np.empty((len(table), 4, 4))
-    for row, matrix in enumerate(matrices):
+    for row, (name, matrix) in enumerate(zip(names, matrices, strict=True)):
+        require_printable(name, folder)
         down, right, backward = matrix[:, :3].T
         try:
             viewmats[row] = viewmat_of_pose(np.column_stack([right, down, -backward]), matrix[:, 3])
@@ -52,7 +47,8 @@ def read_llff(scene: Path) -> Capture:
             raise InputError(f"{source}: the pose in row {row} {error}: {AGAIN}") from None
     Ks = np.tile(np.eye(3), (len(table), 1, 1))
     Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2] = focal[:, None], 0.5 * sizes
-    points = points_in_views(viewmats, Ks, sizes, bounds, NUM_RANDOM_POINTS)
+    points = points_in_views(viewmats, Ks, sizes, bounds)
+    words = f"{len(names)} photos of {folder.name}, no points, so {len(points):,} random ones within the views"
     depths = f"{bounds[:, 0].min():.4g} to {bounds[:, 1].max():.4g}"
     return Capture(
         names=tuple(names),
@@ -62,8 +58,7 @@ def read_llff(scene: Path) -> Capture:
         sizes=sizes.astype(np.int64),
         points=points,
         notes=(
-            f"{source} (LLFF): {len(names)} photos of {folder.name}, no points, so {len(points):,} random ones within "
-            f"the views at depths of {depths}",
+            f"{source} (LLFF): {words} at depths of {depths}",
             *clouds_beside([scene], None, "LLFF's captures begin with random points"),
         ),
         alpha="mask",
@@ -75,8 +70,8 @@ def _read_table(source: Path) -> np.ndarray:
     try:
         # Mapped, so that a header cannot ask for more memory than there is file.
         table = np.array(np.lib.format.open_memmap(source, mode="r"), dtype=np.float64)
-        if table.ndim != 2 or table.shape[1] != COLUMNS:
-            raise ValueError(f"{'x'.join(map(str, table.shape))} where N x {COLUMNS} numbers were expected")
+        if table.ndim != 2 or table.shape[1] != 17:
+            raise ValueError(f"{'x'.join(map(str, table.shape))} where N x 17 numbers were expected")
     except Exception as error:  # numpy's parser of headers lets through whatever it runs into
         reason = " ".join((str(error) or type(error).__name__).split())[:200]
         raise InputError(f"{source} is not a readable table: {reason}; {AGAIN}") from error
@@ -85,15 +80,13 @@ def _read_table(source: Path) -> np.ndarray:
         usable = np.isfinite(lens).all(axis=1) & (lens > 0).all(axis=1)
         usable &= np.isfinite(far) & np.isfinite(1.0 / near) & (near > 0) & (near < far)
     if not usable.all():
-        raise InputError(
-            f"{source}: row {int(np.argmin(usable))} has no positive height, width and focal length, or bounds of "
-            f"depth that are not 0 < near < far: {AGAIN}"
-        )
+        trouble = "no positive height, width and focal length, or bounds of depth that are not 0 < near < far"
+        raise InputError(f"{source}: row {int(np.argmin(usable))} has {trouble}: {AGAIN}")
     return table
 
 
 def _names_of(folder: Path) -> list[str]:
     """The names of a folder's photos, in order."""
-    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    files = list(folder.iterdir()) if folder.is_dir() else []
     files = [f for f in files if f.suffix.lower() in NAMED_SUFFIXES and f.name[0] != "." and f.is_file()]
     return sorted(file.name for file in set(files).difference(maps_beside(files)))

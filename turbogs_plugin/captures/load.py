@@ -1,22 +1,24 @@
-"""Loading: a folder becomes a scene that can be trained on."""
+"""Loading: a folder becomes a capture of one kind, and that a scene that can be trained on."""
 
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
+from turbogs_plugin.captures import llff, transforms
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture
+from turbogs_plugin.captures.colmap import find_model, read_colmap
 from turbogs_plugin.captures.decoding import ALWAYS_PIXELS, channels_of, load_photos, photo_sizes, reduced_sizes
-from turbogs_plugin.captures.kinds import read_capture
 from turbogs_plugin.captures.mask_files import find_masks, load_masks
-from turbogs_plugin.captures.photo_files import IMAGES
+from turbogs_plugin.captures.photo_files import IMAGES, find_photos, unread
 from turbogs_plugin.captures.starting_points import colors_in_photos, starting_points
 from turbogs_plugin.captures.undistort import undistortion_note
 from turbogs_plugin.errors import InputError
@@ -28,19 +30,32 @@ from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.scene.scene import PosedImages, Scene
 from turbogs_plugin.types import Cameras
 
+READERS: dict[str, Callable[[Path], Capture]] = {
+    transforms.FILE: transforms.read_transforms,
+    transforms.TRAIN_FILE: transforms.read_blender,
+    llff.FILE: llff.read_llff,
+}
+"""Readers of files of cameras that are not COLMAP's, in the order in which they are taken."""
+OTHER_POSES = {
+    "OpenSfM or ODM: ns-process-data odm, or OpenSfM's export_colmap": ("opensfm/*.json", "reconstruction*.json"),
+    "Metashape: export its cameras as COLMAP, or ns-process-data metashape": ("*.xml", "*.psx"),
+    "RealityScan: export as COLMAP, or ns-process-data realitycapture": ("*.csv", "*.rspj", "*.rcproj"),
+    "Bundler, VisualSFM or Pix4D: export as COLMAP": ("*.out", "*.nvm", "*calibrated*camera*.txt"),
+    "openMVG or Meshroom: openMVG_main_openMVG2Colmap, or export as COLMAP": ("sfm_data*", "*.sfm"),
+    "Polycam: ns-process-data polycam": ("*cameras/*.json", "keyframes/*cameras", "mesh_info.json"),
+    "Record3D: ns-process-data record3d": ("metadata.json", "EXR_RGBD"),
+    "a tracker: write its poses into a transforms.json": ("pose*.txt", "*traj*.txt", "groundtruth.txt", "*.pose.txt"),
+    "the capture of a model: use that capture": ("cameras.json",),
+}
+"""Files that may have cameras and are not read, by what writes them and the way from there to a capture."""
+SPLITS = ("test.txt", "train.txt", "val.txt", "split.json", "train_test_lists.json", "transforms_test.json")
+"""Files of splits, of which readers of other kinds of captures take none."""
+PARTS_OF_RUN = ("model.ply", "checkpoints", "report")
+"""One of these lies beside the config.yaml of a run that has begun."""
 LENS_PIXELS = 16
 """Pixels of a lens's camera for each of the photo that is undistorted in the camera's size, at most."""
 FARTHEST = 1e15
 """Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
-
-
-class PhotoFiles(NamedTuple):
-    """The files that V photos are read from, and a note on photos of another size than their cameras."""
-
-    paths: list[Path]
-    file_sizes: np.ndarray  # [V, 2] int64 (width, height)
-    sizes: np.ndarray  # [V, 2] int64 to give them, undistorted and reduced
-    note: str = ""
 
 
 def load_scene(
@@ -52,14 +67,13 @@ def load_scene(
 ) -> Scene:
     """Load a capture with its photos.
 
-    Cameras with distortion become pinhole cameras in the same place, their photos are undistorted. Masks are read from
-    where `find_masks` looks, and from the photos' alpha where that is no opacity (`Capture.alpha`); views that are
-    masked whole are left out.
+    Cameras with distortion become pinhole cameras in the same place, their photos are undistorted. Views that are
+    masked whole (`find_masks`, or by the photos' alpha where `Capture.alpha` says so) are left out.
 
     Args:
         path: the scene's folder. Where it could be of several kinds, the first of these is taken: a COLMAP
-            reconstruction (binary or text, in ``sparse``, ``colmap/sparse``, ... or numbered folders of these), a
-            ``transforms.json``, NeRF-synthetic's ``transforms_train.json``, LLFF's ``poses_bounds.npy``.
+            reconstruction (`find_model`), ``transforms.json``, NeRF-synthetic's ``transforms_train.json``, LLFF's
+            ``poses_bounds.npy``.
         factor: photos and intrinsics are reduced by this. Copies in ``images_<factor>`` are used where all are there
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.
@@ -75,96 +89,80 @@ def load_scene(
         if not isinstance(number, int) or number < 1:
             raise InputError(f"{name} is {number}: it must be an integer of at least 1")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
-        capture = _with_points(read_capture(scene))
+        capture = read_capture(scene)
+        capture = capture if len(capture.points) else _with_points(capture)
     test = _test_views(scene, capture, test_every)
     if validation:
         note = f"{test.sum()} test photos are left out: photos that choose settings are among the others"
         capture = capture.subset(np.flatnonzero(~test), np.arange(len(capture.points)), (note,))
         capture = replace(capture, test=None)
         test = _test_views(scene, capture, test_every)
-    frame, viewmats, points = _normalised(scene, capture, test)
-    files = _find_photos(scene, capture, factor)
-    mask_files, mask_note = find_masks(scene, capture, files.paths)
-    masks = load_masks(mask_files, files.paths, capture, files.file_sizes, files.sizes)
+    with np.errstate(over="ignore", invalid="ignore"):
+        frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
+    points = torch.from_numpy(frame.normalise_points(capture.points)).float()  # [M, 3]
+    if (far := ~(points.abs() < FARTHEST).all(dim=1)).any():
+        trouble = f"{int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32"
+        raise InputError(f"{scene}: {trouble}: take them out")
+    files, file_sizes, sizes, size_note = _find_photos(scene, capture, factor)
+    mask_files, mask_note = find_masks(scene, capture, files)
+    masks = load_masks(mask_files, files, capture, file_sizes, sizes)
     seen = np.array([mask is None or mask.pixel_counts[0] > 0 for mask in masks])
     parts = [np.flatnonzero(part & seen) for part in (~test, test)]
     for name, part, views in zip(("training", "test"), (~test, test), parts, strict=True):
         if not len(views):
-            raise InputError(
-                f"{scene}: all {part.sum()} {name} photos are masked whole: zero in a mask, or in "
-                "the alpha of a photo, is masked; mend the masks, or take them away"
-            )
-    train, tested = (
-        _posed(capture, viewmats, files.sizes, masks, views, photos)
-        for views, photos in zip(parts, _load_parts(capture, files, parts, progress), strict=True)
-    )
-    if capture.point_colors is None:
-        point_colors = colors_in_photos(points, train.cameras, train.photos, train.masks)
-    else:
-        point_colors = torch.from_numpy(capture.point_colors)
+            how = "zero in a mask, or in the alpha of a photo, is masked; mend the masks, or take them away"
+            raise InputError(f"{scene}: all {part.sum()} {name} photos are masked whole: {how}")
+    views, count = np.concatenate(parts), len(parts[0])
+    paths, lenses = ([of_view[view] for view in views] for of_view in (files, capture.lenses))
+    channels = channels_of(paths) if capture.alpha == "opacity" else 3
+    photos = load_photos(paths, sizes[views], lenses, channels, progress)  # in one array: its room is found once
+    first = int(photos.offsets[count])
+    train = _posed(capture, frame, masks, parts[0], Photos(photos.colors[:first], photos.sizes[:count]))
+    tested = _posed(capture, frame, masks, parts[1], Photos(photos.colors[first:], photos.sizes[count:]))
     notes = (
-        files.note,
+        *capture.notes,
+        size_note,
         undistortion_note(capture.lenses),
         mask_note,
-        _masked_note(capture.names, masks, files.sizes, seen),
+        _masked_note(capture.names, masks, sizes, seen),
         "transparent photos are composited on a background (train.background)" if train.photos.transparent else "",
         file_note([train.photos.stored, tested.photos.stored], "photos"),
     )
+    given = capture.point_colors
+    shown = train.cameras, train.photos, train.masks
     return Scene(
         name=scene.resolve().name,
         train=train,
         test=tested,
         points=points,
-        point_colors=point_colors,
+        point_colors=colors_in_photos(points, *shown) if given is None else torch.from_numpy(given),
         frame=frame,
         extent=1.0,
-        drawn_points=capture.point_colors is None,
+        drawn_points=given is None,
         doubt=capture.doubt,
-        notes=tuple(filter(None, (*capture.notes, *notes))),
+        notes=tuple(filter(None, notes)),
     )
 
 
-def _load_parts(
-    capture: Capture, files: PhotoFiles, parts: list[np.ndarray], progress: Callable[[int, int], object] | None
-) -> list[Photos]:
-    """The photos of the training views and of the test views, `parts`, in one array: its room is found at once."""
-    views = np.concatenate(parts)
-    paths, lenses = ([of_view[view] for view in views] for of_view in (files.paths, capture.lenses))
-    channels = channels_of(paths) if capture.alpha == "opacity" else 3
-    photos = load_photos(paths, files.sizes[views], lenses, channels, progress)
-    count = len(parts[0])
-    first = int(photos.offsets[count])
-    return [
-        Photos(photos.colors[:first], photos.sizes[:count]),
-        Photos(photos.colors[first:], photos.sizes[count:]),
-    ]
-
-
 def _posed(
-    capture: Capture,
-    viewmats: Tensor,
-    sizes: np.ndarray,
-    masks: list[PixelMasks | None],
-    views: np.ndarray,
-    photos: Photos,
+    capture: Capture, frame: Frame, masks: list[PixelMasks | None], views: np.ndarray, photos: Photos
 ) -> PosedImages:
-    """Some views with their photos, cameras for photos of these `sizes` [V, 2], masks and what the photos show."""
-    ratios = sizes / capture.sizes  # [V, 2]
-    intrinsics = capture.Ks.copy()
+    """Some views with their photos, cameras for photos of these sizes, masks and what the photos show."""
+    ratios = photos.sizes / capture.sizes[views]
+    intrinsics = capture.Ks[views]
     intrinsics[:, :2] *= ratios[:, :, None]
-    cameras = Cameras(viewmats[views], torch.from_numpy(intrinsics[views]).float(), sizes[views])
-    shown = None if capture.observations is None else capture.observations.of_views(views, ratios[views])
+    viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats[views])).float()
+    cameras = Cameras(viewmats, torch.from_numpy(intrinsics).float(), photos.sizes)
+    shown = None if capture.observations is None else capture.observations.of_views(views, ratios)
     own, masked = [masks[view] for view in views], None
     if any(mask is not None for mask in own):
-        pairs = zip(own, sizes[views, ::-1].tolist(), strict=True)  # (height, width)
+        pairs = zip(own, photos.sizes[:, ::-1].tolist(), strict=True)  # (height, width)
         masked = PixelMasks.joined([mask or PixelMasks.of(np.ones(size, dtype=bool)) for mask, size in pairs])
     return PosedImages(cameras, tuple(capture.names[view] for view in views), photos, masked, shown)
 
 
 def _with_points(capture: Capture) -> Capture:
-    """The capture, with points drawn about what its training cameras look at where it has none."""
-    if len(capture.points):
-        return capture
+    """The capture, with points drawn about what its training cameras look at."""
     train = slice(None) if capture.test is None or capture.test.all() else ~capture.test
     points, how = starting_points(capture.viewmats[train], capture.Ks[train], capture.sizes[train])
     note = f"{len(points):,} random points are drawn {how}, as the capture has none"
@@ -184,83 +182,119 @@ def _test_views(scene: Path, capture: Capture, test_every: int) -> np.ndarray:
     return test
 
 
-def _normalised(scene: Path, capture: Capture, test: np.ndarray) -> tuple[Frame, Tensor, Tensor]:
-    """The normalised frame about the training cameras; in it, float32 poses [V, 4, 4] and points [M, 3]."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
-    viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats)).float()
-    points = torch.from_numpy(frame.normalise_points(capture.points)).float()
-    far = ~(points.abs() < FARTHEST).all(dim=1)
-    if far.any():
-        raise InputError(
-            f"{scene}: {int(far.sum())} of {len(far)} 3D points lie too far from the cameras for float32: take them out"
-        )
-    return frame, viewmats, points
-
-
 def _masked_note(names: tuple[str, ...], masks: list[PixelMasks | None], sizes: np.ndarray, seen: np.ndarray) -> str:
     """One line on masked pixels and on views left out for them; empty where nothing is masked."""
     pixels = {view: int(mask.pixel_counts[0]) for view, mask in enumerate(masks) if mask is not None}
     if not pixels:
         return ""
     share = 1.0 - sum(pixels.values()) / int(sizes[list(pixels)].prod(axis=1).sum())
-    gone = [name for name, kept in zip(names, seen, strict=True) if not kept]
-    left_out = f"; {len(gone)} masked whole are left out: {gone[0]}, ..." if gone else ""
+    left_out = f"; {(~seen).sum()} masked whole are left out: {names[seen.argmin()]}, ..." if not seen.all() else ""
     return f"{len(pixels)} photos have masked pixels, {share:.1%} of them{left_out}"
 
 
-def _find_photos(scene: Path, capture: Capture, factor: int) -> PhotoFiles:
-    """The files to read where photos are to be reduced by `factor`: copies in ``images_<factor>`` where all are there
-    in the right size, else the capture's photos. Photos of ``images_4`` that are smaller than their cameras by that are
-    reduced already."""
-    if (copies := _reduced_copies(scene, capture, factor)) is not None:
-        return copies
+def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path], np.ndarray, np.ndarray, str]:
+    """The files of V photos, reduced by `factor`: copies in ``images_<factor>`` where all are there in the right size,
+    else the capture's photos. Photos of ``images_4`` that are smaller than their cameras by that are reduced already.
+
+    Returns:
+        Paths; [V, 2] int64 (width, height) of the files; [V, 2] int64 to give them, undistorted and reduced; a note on
+        photos of another size than their cameras.
+    """
+    cameras, bent = capture.photo_sizes, np.array([lens is not None for lens in capture.lenses])
+    copies = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
+    paths = [copies / name for name in capture.names]
+    # Photos of lenses are undistorted in full size.
+    if factor > 1 and capture.photo_folder != scene and not bent.any() and all(map(Path.is_file, paths)):
+        sizes = photo_sizes(paths)
+        if (np.abs(sizes - cameras / factor) <= 1.0).all():
+            return paths, sizes, sizes, ""
     paths = [capture.photo_folder / name for name in capture.names]
-    sizes = photo_sizes(paths)
-    note = _require_scaled(paths, sizes, capture.photo_sizes)
-    grown = capture.photo_sizes.prod(axis=1) > np.maximum(ALWAYS_PIXELS, LENS_PIXELS * sizes.prod(axis=1))
-    if bent := [view for view in np.flatnonzero(grown) if capture.lenses[view] is not None]:
-        (width, height), camera = sizes[bent[0]].tolist(), "x".join(map(str, capture.photo_sizes[bent[0]].tolist()))
-        raise InputError(
-            f"photo {paths[bent[0]]} is {width}x{height}, too small to be undistorted by a camera of {camera}: use the "
-            "photos that the cameras were reconstructed from"
-        )
+    sizes, note = photo_sizes(paths), ""
+    other = (np.abs(cameras * (sizes / cameras)[:, ::-1] - sizes) > 1.0).all(axis=1)
+    small = bent & (cameras.prod(axis=1) > np.maximum(ALWAYS_PIXELS, LENS_PIXELS * sizes.prod(axis=1)))
+    for wrong in (other, small, (sizes != cameras).any(axis=1)):
+        if not wrong.any():
+            continue
+        path, remedy = paths[wrong.argmax()], "use the photos that the cameras were reconstructed from"
+        size, camera = ("x".join(map(str, both[wrong.argmax()].tolist())) for both in (sizes, cameras))
+        if wrong is other:
+            cause = "it was cropped or turned (an EXIF orientation is not followed), not scaled"
+            raise InputError(f"photo {path} is {size} but its camera is {camera}: {cause}; {remedy}")
+        if wrong is small:
+            raise InputError(f"photo {path} is {size}, too small to be undistorted by a camera of {camera}: {remedy}")
+        note = f"{wrong.sum()} photos in another size than their cameras: intrinsics rescaled from {camera} to {size}"
     reduction = re.fullmatch(rf"{IMAGES}_(\d+)", capture.photo_folder.name)
-    smaller = capture.photo_sizes[0, 0] > 1.5 * sizes[0, 0]
-    already = int(reduction[1]) if reduction and smaller else 1
+    already = int(reduction[1]) if reduction and cameras[0, 0] > 1.5 * sizes[0, 0] else 1
     pairs = zip(capture.lenses, sizes.tolist(), strict=True)
     undistorted = np.array([size if lens is None else lens.size_of(size) for lens, size in pairs], dtype=np.int64)
-    targets = reduced_sizes(undistorted, max(1.0, factor / already))
-    return PhotoFiles(paths, sizes, targets, note)
+    return paths, sizes, reduced_sizes(undistorted, max(1.0, factor / already)), note
 
 
-def _reduced_copies(scene: Path, capture: Capture, factor: int) -> PhotoFiles | None:
-    """The copies in the folder beside the photos; None where one is missing or of another size, or is to be
-    undistorted, which is done in full size."""
-    folder = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
-    paths = [folder / name for name in capture.names]
-    if factor == 1 or capture.photo_folder == scene or any(capture.lenses) or not all(map(Path.is_file, paths)):
-        return None
-    sizes = photo_sizes(paths)
-    if (np.abs(sizes - capture.photo_sizes / factor) > 1.0).any():
-        return None
-    return PhotoFiles(paths, sizes, sizes)
+def read_capture(scene: Path) -> Capture:
+    """The capture in a folder, of the first kind that can be read, in the order that `load_scene` states. Notes say
+    which other kinds are not used, and why where they come before. Raises `InputError` where the folder is no capture,
+    with what to do; or no kind can be read: what the first lacks."""
+    if not scene.is_dir():
+        trouble = f"{scene} is a file" if scene.is_file() else f"{scene} does not exist"
+        raise InputError(f"no such scene: {unread(scene) or f'{trouble}: give the folder of a capture, or of photos'}")
+    kinds, failed = _kinds(scene), []
+    for place, (_, read) in enumerate(kinds):
+        try:
+            capture = read()
+        except InputError as error:
+            failed.append(error)
+            continue
+        splits = (name for name in SPLITS if (scene / name).is_file() and name not in capture.notes[0])
+        unused = ", ".join([*(name for name, _ in kinds[place + 1 :]), *splits])
+        notes = [*([f"{unused} not used"] if unused else []), *(f"not used: {error}" for error in failed)]
+        return replace(capture, notes=(*capture.notes, *notes))
+    raise failed[0] if failed else _no_capture(scene)
 
 
-def _require_scaled(paths: list[Path], sizes: np.ndarray, expected: np.ndarray) -> str:
-    """A note on the photos that are not of their cameras' size; empty where all are.
+def _kinds(scene: Path) -> list[tuple[str, Callable[[], Capture]]]:
+    """Files or folders of cameras in a folder, in the order in which they are taken: names and readers."""
+    model = find_model(scene)
+    colmap = [] if model is None else [(str(model[0]), partial(read_colmap, scene, *model))]
+    return [*colmap, *((name, partial(read, scene)) for name, read in READERS.items() if (scene / name).is_file())]
 
-    Raises:
-        InputError: a photo that is no scaled copy, to a pixel, of one of its camera's size: it was cropped or turned.
-    """
-    scaled = (np.abs(expected * (sizes / expected)[:, ::-1] - sizes) <= 1.0).any(axis=1)
-    others = np.flatnonzero(~scaled if not scaled.all() else (sizes != expected).any(axis=1))
-    if not len(others):
-        return ""
-    size, camera = ("x".join(map(str, both[others[0]].tolist())) for both in (sizes, expected))
-    if not scaled.all():
-        raise InputError(
-            f"photo {paths[others[0]]} is {size} but its camera is {camera}: it was cropped or turned (an EXIF "
-            "orientation is not followed), not scaled; use the photos that the cameras were reconstructed from"
-        )
-    return f"{len(others)} photos in another size than their cameras: intrinsics rescaled from {camera} to {size}"
+
+def holds_photos_alone(scene: Path) -> bool:
+    """True where a folder has photos and nothing that says where they were taken from, neither in it nor around it."""
+    return scene.is_dir() and not _kinds(scene) and bool(find_photos(scene)[1]) and not _elsewhere(scene)
+
+
+def run_folder(folder: Path) -> str:
+    """A line where a folder is a run's; empty where it is none."""
+    if (folder / "config.yaml").is_file() and any((folder / part).exists() for part in PARTS_OF_RUN):
+        return f"{folder} is a run's folder: give the capture that it was trained on, which its config.yaml names"
+    return ""
+
+
+def _elsewhere(folder: Path) -> str:
+    """A line where a folder is a run's, or lies in a capture; empty where it is and does neither."""
+    around = folder.absolute().parent
+    return run_folder(folder) or (f"{folder} lies in the capture {around}: give that folder" if _kinds(around) else "")
+
+
+def other_poses(folder: Path) -> str:
+    """A line on a file of another program's cameras in a folder, or in the one that its ``images`` are of; or empty."""
+    for place in (folder, folder.absolute().parent) if folder.absolute().name == IMAGES else (folder,):
+        for at, (source, forms) in product(("", "*/"), OTHER_POSES.items()):
+            for file in (file for form in forms for file in place.glob(at + form)):
+                return f"{file} is not read, which may have cameras of {source}"
+    return ""
+
+
+def _no_capture(scene: Path) -> InputError:
+    """The error for a folder that is no capture: what it lacks."""
+    if where := _elsewhere(scene):
+        return InputError(where)
+    poses, call = other_poses(scene), f"'turbogs reconstruct {shlex.quote(str(scene))} --out SCENE'"
+    if photos := find_photos(scene)[1]:
+        known = f"{poses}; or" if poses else "nothing that says where they were taken from:"
+        return InputError(f"{scene} has {len(photos)} photos and {known} find the cameras by {call}, then use SCENE")
+    return InputError(
+        f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
+        f"{', a '.join(READERS)}, nor photos; "
+        + (poses or unread(scene, every=True) or "give the folder of a capture, or of photos")
+    )

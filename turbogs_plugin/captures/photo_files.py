@@ -20,20 +20,13 @@ OTHER_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".
 """Suffixes of photos that at least one of them does not read, and that may stand for others (`_stem`)."""
 NAMED_SUFFIXES = (*PHOTO_SUFFIXES, ".webp", ".avif", ".jp2")
 """Suffixes of files that may stand for a photo that is not where a capture names it, as Pillow reads them."""
-FRAMES_OF_VIDEO = "ffmpeg -i VIDEO -vf fps=2 -q:v 2 PHOTOS/%05d.jpg"
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 UNREAD = {
     "convert to JPEG": (*OTHER_SUFFIXES, ".exr", ".hdr", ".raf", ".raw", ".pef", ".jfif", ".jp2", ".gif", ".psd"),
     "it is of a 360 degree camera: export flat views of it": (".insp", ".insv", ".360"),
     "unpack it": (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"),
     "it is Record3D's: 'ns-process-data record3d' makes a capture of it": (".r3d",),
-    f"it is a video: take photos out of it, as by  {FRAMES_OF_VIDEO}": (
-        ".mp4",
-        ".mov",
-        ".m4v",
-        ".avi",
-        ".mkv",
-        ".webm",
-    ),
+    "it is a video: take photos out of it, as by  ffmpeg -i VIDEO -vf fps=2 -q:v 2 PHOTOS/%05d.jpg": VIDEOS,
 }
 """Suffixes of files that are not read, by what to do with them."""
 MASKS = "(.*[_. -])?(mask|matte|segmentation)s?(_images)?"
@@ -49,22 +42,17 @@ MAPS_OF = (rf"(.+?)[._ -]?(?:{_MAPS}|alpha)(?:[_-]?\d+)?", rf"(?:dynamic_)?{_MAP
 PHOTO_DEPTH = 1
 """Photos are looked for in a folder and in the folders in it. The photos of several captures beside each other lie
 deeper, in the ``images`` of each."""
-DEEPEST = 16
-"""Folders of a name that are looked at, the last ones."""
-FOLDER_DEPTH = 4
-"""Named photos are looked for in folders of a capture, no deeper than this."""
+FOLDER_DEPTH = 4  # named photos are looked for in folders of a capture, no deeper than this
+DEEPEST = 16  # folders of a name that are looked at, the last ones
 IMAGES, REDUCED = "images", tuple(f"images_{factor}" for factor in (2, 4, 8, 16))
 """Folder of the photos, and of copies reduced by a factor."""
 
 
 def find_photos(folder: Path) -> tuple[Path, list[Path]]:
-    """The photos of a folder; where it has a folder ``images``, of that one.
-
-    Returns:
-        The folder that their names are relative to; the photos in the order of their names.
-    """
+    """The photos of a folder in the order of their names; where it has a folder ``images``, of that one. And the folder
+    that their names are relative to, first."""
     for place in (folder / IMAGES, folder):
-        files = [path for path in _files(place, PHOTO_DEPTH) if path.suffix.lower() in PHOTO_SUFFIXES]
+        files = [place / path for path in files_below(place, PHOTO_DEPTH) if path.suffix.lower() in PHOTO_SUFFIXES]
         if photos := set(files).difference(maps_beside(files)):
             break
     return place, sorted(photos, key=lambda path: path.relative_to(place).as_posix())
@@ -79,11 +67,11 @@ def maps_beside(files: Iterable[Path]) -> list[Path]:
 
 
 def unread(path: Path, every: bool = False) -> str:
-    """What is not read of the file `path` or in a folder, and what to do; empty where there is nothing. `every`: also
-    files of kinds that captures have nothing to do with."""
+    """What is not read of the file `path` or in a folder, and what to do; or empty. `every`: also files of kinds that
+    captures have nothing to do with."""
     entries = [path, *(path.iterdir() if path.is_dir() else ()), *((path / IMAGES).glob("*"))]
     said = [link for entry in sorted(entries) if (link := broken_link(entry))][:1]
-    files = [path] if path.is_file() else _files(path, PHOTO_DEPTH)
+    files = [path] if path.is_file() else [path / file for file in files_below(path, PHOTO_DEPTH)]
     for advice, suffixes in UNREAD.items():
         if some := [file.name for file in files if file.suffix.lower() in suffixes]:
             which = "1 file is" if len(some) == 1 else f"{len(some)} files are"
@@ -91,10 +79,9 @@ def unread(path: Path, every: bool = False) -> str:
     maps = maps_beside(file for file in files if file.suffix.lower() in PHOTO_SUFFIXES)
     if maps := [file for file in maps if not file.name.endswith(MASK_OF_NAME)]:
         said.append(f"{len(maps)} files are masks or maps of photos by their names, no photos ({maps[0].name})")
-    named_so = (entry for entry in sorted(entries[1:]) if NO_PHOTOS.fullmatch(entry.name))
-    read_so = re.compile(r"\..*|(images|masks)_\d+|masks")  # hidden, or read for what they are
-    others = [entry for entry in named_so if not read_so.fullmatch(entry.name) and find_photos(entry)[1]]
-    said += [f"{folder.name}/ holds no photos by its name" for folder in others]
+    for entry in sorted(entries[1:]):  # but for what is hidden, or read for what it is
+        if NO_PHOTOS.fullmatch(entry.name) and not re.fullmatch(r"\..*|(images|masks)_\d+|masks", entry.name):
+            said += [f"{entry.name}/ holds no photos by its name"] if find_photos(entry)[1] else []
     strange = [file.name for file in files if file.suffix.lower() not in PHOTO_SUFFIXES]
     if every and strange and not said:
         said.append(f"{named(strange)} cannot be read as photos")
@@ -102,29 +89,24 @@ def unread(path: Path, every: bool = False) -> str:
 
 
 def broken_link(path: Path) -> str:
-    """A line where a path, or a folder that it lies in, is a link to what is not there; empty where it is none."""
+    """A line where a path, or a folder that it lies in, is a link to what is not there; or empty."""
     broken = (part for part in (path, *path.parents) if part.is_symlink() and not part.exists())
     return next((f"{part} is a link to {os.readlink(part)}, which is not there: copy that here" for part in broken), "")
 
 
-def _files(folder: Path, depth: int) -> list[Path]:
-    entries = sorted(folder.iterdir()) if folder.is_dir() else []
-    files = [entry for entry in entries if entry.name[0] != "." and entry.is_file()]
-    if depth:
-        inner = [entry for entry in entries if not NO_PHOTOS.fullmatch(entry.name) and entry.is_dir()]
-        files += [file for entry in inner for file in _files(entry, depth - 1)]
-    return files
+def files_below(folder: Path, depth: int = FOLDER_DEPTH, masks: bool = False) -> Iterator[PurePosixPath]:
+    """Paths of files relative to a folder that they lie in, in no folder that is hidden or, but with `masks`, one of
+    `NO_PHOTOS`."""
+    for place, inner, files in os.walk(folder, followlinks=True):
+        at = PurePosixPath(Path(place).relative_to(folder).as_posix())
+        allowed = [name for name in inner if name.isprintable() and (masks or not NO_PHOTOS.fullmatch(name))]
+        inner[:] = sorted(allowed) if len(at.parts) < depth else []
+        yield from (at / file for file in sorted(files) if file[0] != "." and (Path(place) / file).is_file())
 
 
 def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | None:
-    """The path, relative to the scene, of a file that a capture names (`_forms`); None where it is not there.
-
-    Args:
-        folder: of the scene, that names are relative to.
-
-    Raises:
-        InputError: a name that cannot be printed.
-    """
+    """The path, relative to the scene, of a file that a capture names relative to a folder of it (`_forms`); None where
+    it is not there. Raises `InputError` for a name that cannot be printed."""
     require_printable(name, source)
     return next((form for form in _forms(name, folder) if os.path.isfile(f"{scene}/{form}")), None)
 
@@ -170,57 +152,42 @@ def find_named(
     Raises:
         InputError: a name that cannot be printed, a photo that is named twice, or fewer than `FEWEST_PHOTOS` photos.
     """
-    found: list[str | None] = []
-    for places in (folders, *([folder] for folder in REDUCED if (scene / folder).is_dir())):
-        here = [
-            next(filter(None, (file_named(scene, name, source, place) for place in places)), None) for name in names
-        ]
-        found = found or here
-        if len(here) - here.count(None) >= FEWEST_PHOTOS:
-            found = here
-            break
+
+    def named_in(places: Sequence[str]) -> list[str | None]:
+        files = ((file_named(scene, name, source, place) for place in places) for name in names)
+        return [next(filter(None, of_name), None) for of_name in files]
+
+    places = (folders, *([folder] for folder in REDUCED if (scene / folder).is_dir()))
+    enough = (found for found in map(named_in, places) if len(found) - found.count(None) >= FEWEST_PHOTOS)
+    found = next(enough, None) or named_in(folders)
     written = [path or PureWindowsPath(name).as_posix() for path, name in zip(found, names, strict=True)]
     if twice := [path for path, times in Counter(written).items() if times > 1]:
         raise InputError(f"{source} names the photo {twice[0]} twice: take one out, or rename the photos")
     missing = [place for place, path in enumerate(found) if path is None]
     index = {} if not missing else _index(scene, {*written, *(PureWindowsPath(other).as_posix() for other in others)})
-    moved = _distinct({place: _best(_beside(index, names[place], folders), names[place]) for place in missing})
-    if not moved and len(missing) == len(found):
-        moved = _distinct({place: _best(index.get(_stem(names[place]), []), names[place]) for place in missing})
+    alike = {place: index.get(_stem(names[place]), []) for place in missing}
+    said = {p: {PurePosixPath(form).parent for at in folders for form in _forms(names[p], at)} for p in missing}
+    beside = {place: [file for file in files if file.parent in said[place]] for place, files in alike.items()}
+    moved = _distinct(beside, names) or (_distinct(alike, names) if len(missing) == len(found) else {})
     pairs = sorted((moved.get(place) or path or "", place) for place, path in enumerate(found))
     pairs = [(path, place) for path, place in pairs if path]
     absent = [written[place] for place in missing if place not in moved]
     links = (broken_link(scene / form) for name in absent[:1] for place in folders for form in _forms(name, place))
     link = next(filter(None, links), "")
     if absent and len(pairs) < FEWEST_PHOTOS:
-        raise InputError(
-            f"{source} names {len(names)} photos, of which {len(absent)} are missing in {scene} ({named(absent)}): at "
-            f"least {FEWEST_PHOTOS} are needed; {link or 'copy the photos there'}"
-        )
-    note = f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {named(absent, most=1)}"
-    note += f"; {link}" if link else ""
+        lacking = f"{len(absent)} are missing in {scene} ({named(absent)}): at least {FEWEST_PHOTOS} are needed"
+        raise InputError(f"{source} names {len(names)} photos, of which {lacking}; {link or 'copy the photos there'}")
+    notes, ways = [], [(path, PureWindowsPath(names[place]).as_posix()) for place, path in moved.items()]
+    if ways := [(path, name) for path, name in ways if str(PurePosixPath(path).with_suffix("")) != name]:
+        path, name = ways[0]  # more than the suffix is another
+        notes.append(f"{len(ways)} photos are not where {source.name} says: {path} is taken for {name}, ...")
+    if absent:
+        said = f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {named(absent, most=1)}"
+        notes.append("; ".join(filter(None, (said, link))))
     inner = {path.split("/")[0] if "/" in path else "" for path, _ in pairs}
     folder = scene / inner.pop() if len(inner) == 1 else scene
-    return FoundPhotos(
-        folder,
-        tuple((scene / path).relative_to(folder).as_posix() for path, _ in pairs),
-        [place for _, place in pairs],
-        [*_moved_note(names, moved, source), *([note] if absent else [])],
-    )
-
-
-def _moved_note(names: Sequence[str], moved: dict[int, str], source: Path) -> list[str]:
-    """A line on photos that are not where their names say, but for a suffix that names lack."""
-    pairs = [(path, PureWindowsPath(names[place]).as_posix()) for place, path in moved.items()]
-    pairs = [(path, name) for path, name in pairs if str(PurePosixPath(path).with_suffix("")) != name]
-    if not pairs:
-        return []
-    path, name = pairs[0]
-    return [f"{len(pairs)} photos are not where {source.name} says: {path} is taken for {name}, ..."]
-
-
-Index = dict[str, list[PurePosixPath]]
-"""Paths of files relative to a scene, by their stems (`_stem`)."""
+    shown = tuple((scene / path).relative_to(folder).as_posix() for path, _ in pairs)
+    return FoundPhotos(folder, shown, [place for _, place in pairs], notes)
 
 
 def plain(text: str) -> str:
@@ -234,30 +201,13 @@ def _stem(name: str) -> str:
     return plain(path.stem if path.suffix.lower() in (*NAMED_SUFFIXES, *OTHER_SUFFIXES) else path.name)
 
 
-def _index(scene: Path, others: Collection[str]) -> Index:
-    """The files of a scene that may be photos, but for `others`."""
-    files: Index = defaultdict(list)
-    for file in files_below(scene, NO_PHOTOS):
+def _index(scene: Path, others: Collection[str]) -> dict[str, list[PurePosixPath]]:
+    """The files of a scene that may be photos, but for `others`, by their stems."""
+    files = defaultdict(list)
+    for file in files_below(scene):
         if str(file) not in others and file.suffix.lower() in NAMED_SUFFIXES:
             files[_stem(file.name)].append(file)
     return files
-
-
-def files_below(folder: Path, without: re.Pattern | None = None) -> Iterator[PurePosixPath]:
-    """Paths of files relative to a folder that they lie in, `FOLDER_DEPTH` deep; but for folders of some names."""
-    for place, inner, files in os.walk(folder, followlinks=True):
-        at = PurePosixPath(Path(place).relative_to(folder).as_posix())
-        allowed = [name for name in inner if name.isprintable() and not (without and without.fullmatch(name))]
-        inner[:] = sorted(allowed) if len(at.parts) < FOLDER_DEPTH else []
-        yield from (at / file for file in sorted(files) if (Path(place) / file).is_file())
-
-
-def _beside(index: Index, name: str, folders: Sequence[str]) -> list[PurePosixPath]:
-    """The files of a name's stem in a folder that the name says."""
-    if not (files := index.get(_stem(name))):
-        return []
-    places = {PurePosixPath(form).parent for folder in folders for form in _forms(name, folder)}
-    return [file for file in files if file.parent in places]
 
 
 def _best(files: Sequence[PurePosixPath], name: str) -> str:
@@ -270,7 +220,8 @@ def _best(files: Sequence[PurePosixPath], name: str) -> str:
     return str(best[0]) if len(best) == 1 else ""
 
 
-def _distinct(moved: dict[int, str]) -> dict[int, str]:
-    """The places whose file is no other place's."""
-    times = Counter(moved.values())
-    return {place: path for place, path in moved.items() if path and times[path] == 1}
+def _distinct(files: dict[int, list[PurePosixPath]], names: Sequence[str]) -> dict[int, str]:
+    """The file that the name of each place stands for, where it is no other place's."""
+    best = {place: _best(of_place, names[place]) for place, of_place in files.items()}
+    times = Counter(best.values())
+    return {place: path for place, path in best.items() if path and times[path] == 1}

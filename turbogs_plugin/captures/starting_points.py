@@ -18,21 +18,19 @@ from turbogs_plugin.types import Cameras
 from turbogs_plugin.types.gaussians import SH_C0
 
 NUM_RANDOM_POINTS = 50_000
-GREY = 128
-"""Colour of points without one."""
+GREY = 128  # colour of points without one
 MODEL_PROPERTIES = {"opacity", "f_dc_0", "scale_0", "rot_0", "packed_position"}
 """Properties of a .ply of which a model has at least one, and a cloud of points none."""
 LOOKING = 0.9
 """Share of the views that must have one point in their images to be taken for views of one thing."""
 LEAST_SPACING = 1e-2
 """Cameras nearer to each other than this share of their extent are taken to be in one place."""
-COLOR_VIEWS = 32
-"""Photos that give random points their colours, at most."""
+COLOR_VIEWS = 32  # photos that give random points their colours, at most
 
 
-def read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """[M, 3] float64 and [M, 3] uint8 of a cloud in a .ply; None where it has no colours. A 3DGS model's colours are
-    its harmonics of degree 0."""
+def read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
+    """[M, 3] float64 and [M, 3] uint8 of a cloud in a .ply, and words on it where it has no colours and is grey. A 3DGS
+    model's colours are its harmonics of degree 0."""
     vertices = {name.lower().removeprefix("diffuse_"): column for name, column in read_vertices(path).items()}
     if not {"x", "y", "z"} <= set(vertices):
         raise InputError(f"{path} has no x, y, z: export it again, or take it out")
@@ -42,67 +40,54 @@ def read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
             vertices.setdefault(channel, vertices[channel[0]])
         elif share in vertices:
             vertices.setdefault(channel, (0.5 + SH_C0 * vertices[share].astype(np.float64)).clip(0.0, 1.0))
-    return points, read_colors(path, vertices)
+    if (colors := read_colors(path, vertices)) is None:
+        return points, np.full(points.shape, GREY, np.uint8), ", grey as it has no colours"
+    return points, colors, ""
 
 
 def plain_cloud(file: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Finite points of a .ply, [M, 3] float64 and [M, 3] uint8, grey where it has no colours; None where it is a
-    model's, or no .ply."""
+    """Finite points of a .ply, [M, 3] float64 and [M, 3] uint8; None where it is a model's, or no .ply."""
     if Path(file).suffix.lower() != ".ply" or not MODEL_PROPERTIES.isdisjoint(read_vertices(file)):
         return None
-    points, colors = read_cloud(Path(file))
+    points, colors, _ = read_cloud(Path(file))
     finite = np.isfinite(points).all(axis=1)
     if not finite.any():
         raise InputError(f"{file} has no finite point: export it again")
-    return points[finite], np.full(points.shape, GREY, np.uint8)[finite] if colors is None else colors[finite]
+    return points[finite], colors[finite]
 
 
 def clouds_beside(folders: Sequence[Path], used: Path | None, remedy: str) -> list[str]:
     """A line on clouds in some folders that are not used; none where there is none. `remedy`: how they would be."""
-    files = [file for folder in folders for file in sorted(folder.glob("*.[pP][lL][yY]")) if file != used]
-    return [f"{', '.join(file.name for file in files[:3])} not used: {remedy}"] if files else []
+    files = [file.name for folder in folders for file in sorted(folder.glob("*.[pP][lL][yY]")) if file != used]
+    return [f"{', '.join(files[:3])} not used: {remedy}"] if files else []
 
 
 def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, str]:
-    """Points for a capture without any, the same for the same cameras, and how they were drawn.
+    """[`NUM_RANDOM_POINTS`, 3] float64 for a capture without any, the same for the same cameras: world to camera
+    [V, 4, 4], intrinsics [V, 3, 3] (float64), sizes [V, 2] (width, height). And words that go on from "random points".
 
     Where cameras look at one thing (`LOOKING`), points fill a cube about the point nearest to all viewing axes, whose
     side is the median distance of the cameras from it. Elsewhere they are drawn within the views, by `_depth_bounds`.
-
-    Args:
-        viewmats: [V, 4, 4] float64 world to camera.
-        Ks: [V, 3, 3] float64 intrinsics.
-        sizes: [V, 2] (width, height).
-
-    Returns:
-        [`NUM_RANDOM_POINTS`, 3] float64, and words that go on from "random points".
     """
-    centers = camera_centers(viewmats)
-    axes = viewmats[:, 2, :3]
-    # A slight pull towards the cameras' mean settles the case of parallel axes.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [V, 3, 3]
+    centers, axes = camera_centers(viewmats), viewmats[:, 2, :3]
     mean = centers.mean(axis=0)
-    pull = 1e-3 * len(centers) * np.eye(3)
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [V, 3, 3]
+    pull = 1e-3 * len(centers) * np.eye(3)  # a slight one towards the mean settles the case of parallel axes
     offsets = np.einsum("vij,vj->i", across, centers - mean)
     focus = mean + np.linalg.solve(across.sum(axis=0) + pull, offsets)
     x, y, depth = np.einsum("vij,vj->iv", Ks, viewmats[:, :3, :3] @ focus + viewmats[:, :3, 3])
     inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < sizes[:, 0] * depth) & (y < sizes[:, 1] * depth)
     if inside.mean() < LOOKING:
-        bounds = np.tile(_depth_bounds(centers), (len(centers), 1))
-        within = points_in_views(viewmats, Ks, sizes, bounds, NUM_RANDOM_POINTS)
+        within = points_in_views(viewmats, Ks, sizes, np.tile(_depth_bounds(centers), (len(centers), 1)))
         return within, "before the cameras, which do not look at one thing"
-    side = float(np.median(np.linalg.norm(centers - focus, axis=1)))
-    random = np.random.default_rng(0)
-    points = focus + random.uniform(-0.5, 0.5, (NUM_RANDOM_POINTS, 3)) * (side or 1.0)
-    return points, "about what the cameras look at"
+    side = float(np.median(np.linalg.norm(centers - focus, axis=1))) or 1.0
+    within = np.random.default_rng(0).uniform(-0.5, 0.5, (NUM_RANDOM_POINTS, 3))
+    return focus + within * side, "about what the cameras look at"
 
 
 def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
-    """Nearest and farthest depth that cameras at `centers` [V, 3] can tell from others, as a guess.
-
-    The extent is the median distance from the mean. Along a path, what is seen is nearer than that: the nearest depth
-    is the geometric mean of extent and spacing, at most half the extent.
-    """
+    """Nearest and farthest depth that cameras at `centers` [V, 3] can tell from others, as a guess: the geometric mean
+    of extent (the median distance from the mean) and spacing, at most half the extent; and ten times the extent."""
     mean = centers[0] + (centers - centers[0]).mean(axis=0)
     extent = float(np.median(np.linalg.norm(centers - mean, axis=1)))
     if extent <= 1e-12 * np.abs(centers).max():  # all in one place but for rounding
@@ -114,22 +99,13 @@ def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
     return extent * min(0.5, spacing**0.5), extent * 10.0
 
 
-def points_in_views(
-    viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, bounds: np.ndarray, count: int
-) -> np.ndarray:
-    """[M, 3] float64 points drawn at random, the same for the same arguments.
+def points_in_views(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """[`NUM_RANDOM_POINTS`, 3] float64 points drawn at random, the same for the same arguments.
 
-    A view and a place in it are drawn evenly, and the inverse of the depth: so the points lie as densely in the image
-    as in depth, as far as parallax can tell depths apart.
-
-    Args:
-        viewmats: [V, 4, 4] float64, world to camera.
-        Ks: [V, 3, 3] float64 intrinsics.
-        sizes: [V, 2] (width, height).
-        bounds: [V, 2] float64, nearest and farthest depth.
-        count: M.
+    A view and a place in it are drawn evenly, and the inverse of the depth between its nearest and farthest, `bounds`
+    [V, 2]: so the points lie as densely in the image as in depth, as far as parallax can tell depths apart.
     """
-    random = np.random.default_rng(0)
+    random, count = np.random.default_rng(0), NUM_RANDOM_POINTS
     views = random.integers(0, len(viewmats), count)
     pixels = random.uniform(size=(count, 2)) * sizes[views]
     shares = random.uniform(size=count)
@@ -142,15 +118,11 @@ def points_in_views(
 
 
 def colors_in_photos(points: Tensor, cameras: Cameras, photos: Photos, masks: PixelMasks | None = None) -> Tensor:
-    """[M, 3] uint8: for each point the mean colour of the pixels at which photos see it, hidden or not.
+    """[M, 3] uint8: for each point [M, 3] float32 the mean colour of the pixels at which at most `COLOR_VIEWS` photos,
+    evenly spread, see it, hidden or not.
 
-    Masked pixels do not count, and transparent ones by their alpha. Points that none sees get the mean of the others;
-    grey where there is none.
-
-    Args:
-        points: [M, 3] float32.
-        cameras, photos: of V views in the same coordinates, of which at most `COLOR_VIEWS`, evenly spread, are used.
-        masks: which pixels count, on the CPU; None for all.
+    Masked pixels (`masks`, on the CPU) do not count, and transparent ones by their alpha. Points that none sees get the
+    mean of the others; grey where there is none.
     """
     cameras, points = cameras.to("cpu", torch.float32), points.cpu()
     sums, counts = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
@@ -169,5 +141,5 @@ def colors_in_photos(points: Tensor, cameras: Cameras, photos: Photos, masks: Pi
             seen *= masks.image(view).reshape(-1)[pixels, None]
         sums.index_add_(0, inside, seen[:, :3])  # which are multiplied by alpha already
         counts.index_add_(0, inside, seen[:, 3:] / 255.0)
-    others = sums.sum(dim=0) / counts.sum() if counts.any() else torch.full((3,), 128.0)
+    others = sums.sum(dim=0) / counts.sum() if counts.any() else torch.full((3,), float(GREY))
     return torch.where(counts > 0, sums / counts.clamp(min=1e-9), others).round().to(torch.uint8)

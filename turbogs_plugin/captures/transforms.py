@@ -1,72 +1,81 @@
 """Cameras in JSON: ``transforms.json`` of nerfstudio and instant-ngp, and NeRF-synthetic's ``transforms_train.json``.
 
-NeRF-synthetic tells training and test photos apart by file; its photos are named without a suffix and often
-transparent.
+Cameras have OpenGL's axes (x right, y up, z backward). NeRF-synthetic tells training and test photos apart by file; its
+photos are named without a suffix and often transparent.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
+from functools import partial
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
-from turbogs_plugin.captures.camera_json import FOR_ALL, opengl_viewmat, read_camera, read_frames
-from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, text_of
+from turbogs_plugin.captures.colmap import load_pycolmap
+from turbogs_plugin.captures.decoding import photo_size
 from turbogs_plugin.captures.photo_files import file_named, find_named
-from turbogs_plugin.captures.starting_points import GREY, clouds_beside, read_cloud
+from turbogs_plugin.captures.starting_points import clouds_beside, read_cloud
+from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens, lens_of_camera
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.geometry import viewmat_of_pose
+from turbogs_plugin.yaml_json import parse_json
 
 FILE, TRAIN_FILE = "transforms.json", "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")
 """NeRF-synthetic's files of test photos: the first that is there, and has a photo, is used."""
 TRAIN, VALIDATION, TEST = LISTS = ("train_filenames", "val_filenames", "test_filenames")
 """Lists of file names in a ``transforms.json`` that are the capture's own split."""
-
-TEST_FRAMES = "test_frames"
-"""Frames to test on, which are not among the others (ScanNet++)."""
+TEST_FRAMES = "test_frames"  # frames to test on, which are not among the others (ScanNet++)
+BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+"""Names of one model, whose missing coefficients are 0."""
+FISHEYE = "OPENCV_FISHEYE"
+BENDS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Coefficients of distortion, in the order of COLMAP's FULL_OPENCV."""
+FOR_ALL = {*("camera_model", "is_fisheye", "w", "h", *BENDS, "mask_path"),
+           *("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")}  # fmt: skip
+"""Keys of a file that hold for each frame without a value of its own."""
 
 Frame = dict[str, Any]
 """A frame of a file, with what stands there for all frames."""
 
 
 def read_transforms(scene: Path) -> Capture:
-    """Read ``scene/transforms.json``, with the split of its lists, and points of its ``ply_file_path``.
-
-    Raises:
-        InputError: a file that is not such JSON, lacks something or describes no lens; a photo that two frames name;
-            lists that are no split; a cloud that is absent or damaged.
-    """
-    source = scene / FILE
-    content, frames = _frames(source)
-    split = _own_split(content, frames, source)
-    words, test = "", None
-    if split is not None:
-        train, test = split
-        used = [frame for frame in frames if _written(frame) in train | test]
-        words = f", {len(frames) - len(used)} others not used" if len(used) < len(frames) else ""
-        frames = used
+    """Read ``scene/transforms.json``, with the split of its lists, and points of its ``ply_file_path``. Raises
+    `InputError` for a file that is not such JSON, lacks something or describes no lens; a photo that two frames name;
+    lists that are no split; a cloud that is absent or damaged."""
+    content, frames = _frames(source := scene / FILE)
+    train, test = _own_split(content, [_written(frame) for frame in frames], source)
+    used = [frame for frame in frames if _written(frame) in train | test]
+    words = f", {len(frames) - len(used)} others not used" if len(used) < len(frames) else ""
     if content.get(TEST_FRAMES):
         tested = _frames(source, TEST_FRAMES)[1]
-        frames, test = [*frames, *tested], {*(test or ()), *map(_written, tested)}
-        words += f", with {TEST_FRAMES}"
-    return _capture(scene, source, content, frames, test, f"nerfstudio, instant-ngp{words}")
+        used, test, words = [*used, *tested], {*test, *map(_written, tested)}, f"{words}, with {TEST_FRAMES}"
+    return _capture(scene, source, content, used, test, f"nerfstudio, instant-ngp{words}")
 
 
 def read_blender(scene: Path) -> Capture:
     """Read a NeRF-synthetic capture, with the split of its files; where there are no test photos, the split is left to
-    the order of the photos.
-
-    Raises:
-        InputError: as `read_transforms`; one photo in both files.
-    """
-    source = scene / TRAIN_FILE
-    content, train = _frames(source)
+    the order of the photos. Raises `InputError` as `read_transforms`, and for one photo in both files."""
+    content, train = _frames(source := scene / TRAIN_FILE)
     test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
-    tested = [] if test_file is None else _frames(test_file)[1]
-    words = f"NeRF-synthetic{f', with {test_file.name}' if test_file else ''}"
-    return _capture(scene, source, content, [*train, *tested], {_written(frame) for frame in tested}, words)
+    tested, words = ([], "") if test_file is None else (_frames(test_file)[1], f", with {test_file.name}")
+    test = {_written(frame) for frame in tested}
+    return _capture(scene, source, content, [*train, *tested], test, f"NeRF-synthetic{words}")
+
+
+def read_frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """A transforms file and its frames under a key, without null and empty texts, which other writers have for what is
+    absent. Raises `InputError` unless it is JSON with a list of frames."""
+    content = parse_json(text_of(source), str(source))
+    frames = content.get(key) if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError(f"{source} has no list of {key}: export it again")
+    content, *frames = ({k: v for k, v in each.items() if v is not None and v != ""} for each in (content, *frames))
+    return content, frames
 
 
 def _frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[Frame]]:
@@ -74,8 +83,8 @@ def _frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[Fra
     content, frames = read_frames(source, key)
     if not all(isinstance(frame.get("file_path"), str) for frame in frames):
         raise InputError(f"{source} has a frame without a file_path: export it again")
-    shared = {key: content[key] for key in FOR_ALL if key in content}
-    return content, [{**shared, **frame} for frame in frames]
+    shared = {key: value for key, value in content.items() if key in FOR_ALL}
+    return content, [shared | frame for frame in frames]
 
 
 def _written(frame: Frame) -> str:
@@ -84,19 +93,12 @@ def _written(frame: Frame) -> str:
 
 
 def _capture(
-    scene: Path,
-    source: Path,
-    content: dict[str, Any],
-    frames: list[Frame],
-    test: Collection[str] | None,
-    words: str,
+    scene: Path, source: Path, content: dict[str, Any], frames: list[Frame], test: Collection[str], words: str
 ) -> Capture:
     """The capture of some frames, in the order of their photos' names; damaged poses are left out (`Capture.checked`).
 
-    Args:
-        content: of the file; its ``ply_file_path`` has the points.
-        test: written names of the test photos; None, and where none of them exists: no own split.
-        words: on the kind of capture.
+    `content` is the file's, whose ``ply_file_path`` has the points; `test` has written names of the test photos: where
+    none of them exists, there is no own split; `words` are on the kind of capture.
     """
     names, cloud = [_written(frame) for frame in frames], content.get("ply_file_path")
     others = {text for frame in frames for key, text in frame.items() if key != "file_path" and isinstance(text, str)}
@@ -110,14 +112,13 @@ def _capture(
             pose = np.full((4, 4), np.nan)
             damaged.append(error)
         mask = None if "mask_path" not in frame else _file(scene, frame["mask_path"], f"mask_path of {owner}", source)
-        rows.append((pose, *read_camera(frame, found.folder / name, source), mask))
+        rows.append((pose, *_read_camera(frame, found.folder / name, source), mask))
     viewmats, Ks, sizes, lenses, masks = zip(*rows, strict=True)
     points, colors, file = np.empty((0, 3)), None, None
     if cloud is not None:
-        points, colors = read_cloud(file := _file(scene, cloud, "ply_file_path", source))
-        words += f", {len(points):,} points of {cloud}{', grey as it has no colours' if colors is None else ''}"
-        colors = np.full(points.shape, GREY, np.uint8) if colors is None else colors
-    tested = np.array([names[place] in (test or ()) for place in found.places])
+        points, colors, grey = read_cloud(file := _file(scene, cloud, "ply_file_path", source))
+        words += f", {len(points):,} points of {cloud}{grey}"
+    tested = np.array([names[place] in test for place in found.places])
     if damaged and (np.isfinite(viewmats).all(axis=(1, 2)) & ~tested).sum() < FEWEST_PHOTOS:
         raise damaged[0]
     split = f", by its own split {(~tested).sum()} for training, {tested.sum()} for testing" if tested.any() else ""
@@ -140,19 +141,15 @@ def _capture(
     ).checked(source)
 
 
-def _own_split(content: dict[str, Any], frames: list[Frame], source: Path) -> tuple[set[str], set[str]] | None:
-    """Written names of the training and of the test photos, by the lists of a ``transforms.json``; None without any.
+def _own_split(content: dict[str, Any], written: list[str], source: Path) -> tuple[set[str], set[str]]:
+    """Written names of the training and of the test photos, by the lists of a ``transforms.json``; no test photos
+    without any list.
 
     Test photos are in ``test_filenames``; where that is absent or empty, in ``val_filenames``. Where both are, all
-    photos that are not for training are tests. Without ``train_filenames``, what is in no other list trains.
-
-    Raises:
-        InputError: lists that are no split.
-    """
-    lists = {key: content[key] for key in LISTS if content.get(key)}
+    photos that are not for training are tests. Without ``train_filenames``, what is in no other list trains."""
+    lists, everything = {key: content[key] for key in LISTS if content.get(key)}, set(written)
     if not lists:
-        return None
-    everything = {_written(frame) for frame in frames}
+        return everything, set()
     if all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists.values()):
         listed = {key: {PureWindowsPath(name).as_posix() for name in names} for key, names in lists.items()}
         test, validation = listed.get(TEST, set()), listed.get(VALIDATION, set())
@@ -160,10 +157,8 @@ def _own_split(content: dict[str, Any], frames: list[Frame], source: Path) -> tu
         test = test or validation or everything - train
         if train and test and not train & test and train | test | validation <= everything:
             return train, test
-    raise InputError(
-        f"{source}: {', '.join(lists)} are no split: give lists of frames' file_path, with photos to train and to test "
-        "on and none for both"
-    )
+    remedy = "give lists of frames' file_path, with photos to train and to test on and none for both"
+    raise InputError(f"{source}: {', '.join(lists)} are no split: {remedy}")
 
 
 def _file(scene: Path, name: Any, what: str, source: Path) -> Path:
@@ -172,3 +167,83 @@ def _file(scene: Path, name: Any, what: str, source: Path) -> Path:
     if path is None:
         raise InputError(f"{source}: its {what}, {str(name)[:200]!r}, is not there: bring it back, or take it out")
     return scene / path
+
+
+def number_of(values: dict, source: Path, key: str, default: float | None = None) -> float | None:
+    """A finite number, also one that is written as text, or the default where the key is absent."""
+    if key not in values:
+        return default
+    value = values[key]
+    try:
+        if isinstance(value, bool) or not abs(number := float(value)) < 1e300:
+            raise ValueError
+    except (ValueError, TypeError, OverflowError):
+        raise InputError(f"{source}: {key} is {str(value)[:40]!r}: it must be a finite number") from None
+    return number
+
+
+def _read_camera(values: Frame, photo: Path, source: Path) -> tuple[np.ndarray, tuple[int, int], Lens | None]:
+    """[3, 3] float64 intrinsics, (width, height), and the lens where there is distortion, of one frame."""
+    number, owner = partial(number_of, values, source), f"{source}: the camera of {photo.name}"
+    width, height = number("w"), number("h")
+    if width is None or height is None:
+        width, height = photo_size(photo)
+    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
+        raise InputError(f"{owner} is {width:g}x{height:g} pixels: write the photo's size as w and h, or take them out")
+    K, size = pinhole(values, source, (width, height)), (round(width), round(height))
+    if K is None:
+        remedy = "write one of them there (pixels, radians), or find the cameras anew by 'turbogs reconstruct'"
+        raise InputError(f"{owner} has neither fl_x nor a camera_angle_x in 0 .. pi: {remedy}")
+    fisheye = str(values.get("is_fisheye")).lower() in ("true", "1")
+    model = str(values.get("camera_model", FISHEYE if fisheye else "OPENCV")).upper()
+    if model not in (*BROWN_MODELS, FISHEYE):
+        known = ", ".join((*BROWN_MODELS, FISHEYE))
+        raise InputError(f"{owner} is a {model[:40]!r}: known are {known}; use the capture's COLMAP reconstruction")
+    bends = {key: number(key, 0.0) or 0.0 for key in BENDS}
+    known = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "k3", "p1", "p2")
+    if unknown := " and ".join(key for key, value in bends.items() if value and key not in known):
+        raise InputError(f"{owner} has {unknown}, which {model} does not have: use the capture's COLMAP reconstruction")
+    if model != FISHEYE and not any(bends.values()):
+        return K, size, None
+    kind, keys = ("FULL_OPENCV", BENDS) if bends["k3"] else ("OPENCV", BENDS[:4])
+    if model == FISHEYE:
+        kind, keys = FISHEYE, known
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *(bends[key] for key in keys)]
+    lens = lens_of_camera(load_pycolmap().Camera(model=kind, width=size[0], height=size[1], params=params), owner)
+    return (K, size, None) if lens is None else (lens.K, lens.size, lens)
+
+
+def pinhole(values: dict, source: Path, size: tuple[float, float]) -> np.ndarray | None:
+    """[3, 3] float64 intrinsics of one frame; None where nothing gives its horizontal focal length. The principal point
+    is in the middle of the `size` (width, height) unless it is given."""
+    focals: list[float | None] = []
+    for axis, side in zip("xy", size, strict=True):
+        focal = number_of(values, source, f"fl_{axis}")
+        angle = number_of(values, source, f"camera_angle_{axis}") if focal is None else None
+        if angle is not None and 0 < angle < math.pi:
+            focal = 0.5 * side / math.tan(0.5 * angle)
+        focals.append(focals[0] if focal is None and focals else focal)
+    if focals[0] is None:
+        return None
+    x, y = (number_of(values, source, f"c{axis}", 0.5 * side) for axis, side in zip("xy", size, strict=True))
+    return np.array([[focals[0], 0.0, x], [0.0, focals[1], y], [0.0, 0.0, 1.0]])
+
+
+def opengl_viewmat(matrix: Any, owner: str) -> np.ndarray:
+    """[4, 4] float64 world to camera, of a camera-to-world matrix in OpenGL's axes; its numbers may be in one row, and
+    the matrix be transposed, where its last column says so. Raises `InputError` where it is no matrix of 4x4 finite
+    numbers, or no rotation and translation; `owner` names it."""
+    try:
+        pose = np.array(matrix, dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        pose = np.empty(0)
+    if pose.shape in ((12,), (16,)):
+        pose = pose.reshape(-1, 4)
+    if pose.shape == (4, 4) and (pose[:, 3] == (0, 0, 0, 1)).all():
+        pose = pose.T  # or the camera is in the origin, and has a last row like that, too
+    if pose.shape not in ((3, 4), (4, 4)):
+        raise InputError(f"{owner} is no matrix of 4x4 numbers: export it again")
+    try:
+        return viewmat_of_pose(pose[:3, :3] * [1.0, -1.0, -1.0], pose[:3, 3])
+    except ValueError as error:
+        raise InputError(f"{owner} {error}: export it again, without a scale of the camera") from None

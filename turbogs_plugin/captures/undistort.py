@@ -19,38 +19,28 @@ from turbogs_plugin.errors import InputError
 if TYPE_CHECKING:
     import pycolmap
 
+LARGEST_SIDE = 65535
+"""Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
 STRAIGHT_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """COLMAP's camera models that are a pinhole where all their parameters of distortion, if any, are 0."""
 WIDEST_ANGLE = math.radians(60.0)
 """Largest angle off the axis in the pinhole image: a fisheye's rim would become a smear."""
 LARGEST_GROWTH = 2.0
 """The pinhole image has at most this many times the sides of the photo (COLMAP's `max_scale`)."""
-GRID = 129
-"""Places along either side of a pinhole image at which it is checked against the photo."""
+GRID = 129  # places along either side of a pinhole image at which it is checked against the photo
 SMALLEST_SHARE = 0.1
 """A pinhole image that covers less of the photo's width or height is not one of a lens."""
-EDGE = 0.5
-"""Pixels by which the border of the pinhole image may leave the photo."""
+EDGE = 0.5  # pixels by which the border of the pinhole image may leave the photo
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A camera with distortion and the pinhole camera that takes its place.
-
-    Args:
-        camera: as it is.
-        size: (width, height) of the pinhole's images.
-        K: [3, 3] float64, intrinsics of the pinhole.
-    """
+    """A camera with distortion, and the pinhole camera that takes its place: (width, height) of its images, and its
+    intrinsics [3, 3] float64."""
 
     camera: pycolmap.Camera
     size: tuple[int, int]
     K: np.ndarray
-
-    @property
-    def model(self) -> str:
-        """Name of the camera model, as COLMAP has it."""
-        return self.camera.model.name
 
     @property
     def photo_size(self) -> tuple[int, int]:
@@ -58,11 +48,11 @@ class Lens:
         return self.camera.width, self.camera.height
 
     def size_of(self, photo_size: tuple[int, int]) -> tuple[int, int]:
-        """(width, height) of the pinhole's image for photos of another size than those that it was calibrated on:
-        smaller for smaller ones, and no larger for larger ones."""
+        """(width, height) of the pinhole's image for photos of a size: smaller for ones below `photo_size`, no larger for
+        others."""
         ratios = np.divide(photo_size, self.photo_size).clip(max=1.0)
-        width, height = np.floor(np.multiply(self.size, ratios) + 0.5).astype(np.int64).tolist()
-        return max(width, 1), max(height, 1)
+        width, height = np.floor(np.multiply(self.size, ratios) + 0.5).astype(np.int64).clip(min=1).tolist()
+        return width, height
 
     def undistort(self, photo: Image.Image) -> Image.Image:
         """The pinhole's image, of `size`. Photos of another size than `photo_size` get that first."""
@@ -70,58 +60,47 @@ class Lens:
 
         if photo.size != self.photo_size:
             photo = photo.resize(self.photo_size, Image.Resampling.BILINEAR)
-        planes = np.asarray(photo).reshape(photo.height, photo.width, -1)
-        parts = [planes[..., :3], planes[..., 3:]] if planes.shape[2] == 4 else [planes]  # COLMAP knows no alpha
-        made = []
-        for part in parts:
-            bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(part))
-            image, _ = pycolmap.undistort_image(_options(), bitmap, self.camera)
-            made.append(image.to_array().reshape(*self.size[::-1], -1))
+        planes, made = np.asarray(photo).reshape(photo.height, photo.width, -1), []
+        for part in (planes[..., :3], planes[..., 3:]):  # COLMAP knows no alpha
+            if part.shape[2]:
+                bitmap = pycolmap.Bitmap.from_array(np.ascontiguousarray(part))
+                image, _ = pycolmap.undistort_image(_options(), bitmap, self.camera)
+                made.append(image.to_array().reshape(*self.size[::-1], -1))
         return Image.frombytes(photo.mode, self.size, np.concatenate(made, axis=2).tobytes())
 
 
 def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
-    """The lens of a camera of any of COLMAP's models; None for a pinhole.
-
-    Args:
-        owner: names the camera in messages.
-
-    Raises:
-        InputError: parameters that are not those of a lens within the photo; a panorama, which no pinhole camera can
-            show.
-    """
-    model, extra = camera.model.name, list(camera.extra_params_idxs())
-    if model in STRAIGHT_MODELS and not camera.params[extra].any():
+    """The lens of a camera of any of COLMAP's models; None for a pinhole, and for an impossible size, which
+    `Capture.checked` refuses. Raises `InputError` for a panorama, which no pinhole camera can show, and for parameters
+    that are not those of a lens within the photo; `owner` names the camera."""
+    model, size = camera.model.name, (camera.width, camera.height)
+    bent = model not in STRAIGHT_MODELS or camera.params[list(camera.extra_params_idxs())].any()
+    if not bent or max(size) > LARGEST_SIDE:
         return None
     if not camera.is_perspective():
-        raise InputError(
-            f"{owner} is {model}, a panorama: cut it into perspective photos and reconstruct these "
-            "(pycolmap's example panorama_sfm.py does both)"
-        )
-    lens = _lens(model, (camera.width, camera.height), tuple(camera.params.tolist()))
-    if lens is None:
-        raise InputError(
-            f"{owner} is {model} with parameters that are not those of a lens, or whose image folds within the photo: "
-            "reconstruct the capture again, with the model OPENCV_FISHEYE for a wide lens"
-        )
+        remedy = "cut it into perspective photos and reconstruct these (pycolmap's example panorama_sfm.py does both)"
+        raise InputError(f"{owner} is {model}, a panorama: {remedy}")
+    if (lens := _lens(model, size, tuple(camera.params.tolist()))) is None:
+        trouble = "with parameters that are not those of a lens, or whose image folds within the photo"
+        remedy = "reconstruct the capture again, with the model OPENCV_FISHEYE for a wide lens"
+        raise InputError(f"{owner} is {model} {trouble}: {remedy}")
     return lens
 
 
 @lru_cache(maxsize=64)
-def _lens(model: str, photo_size: tuple[int, int], params: tuple[float, ...]) -> Lens | None:
+def _lens(model: str, size: tuple[int, int], params: tuple[float, ...]) -> Lens | None:
     """The lens of a camera's numbers, which the cameras of many photos share; None where they are not those of one."""
     import pycolmap
 
     if not np.isfinite(params).all():
         return None
-    camera = pycolmap.Camera(model=model, width=photo_size[0], height=photo_size[1], params=params)
+    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=params)
     try:
         pinhole = pycolmap.undistort_camera(_options(), camera)
     except Exception:  # pycolmap raises whatever C++ threw
         return None
-    return (
-        Lens(camera, (pinhole.width, pinhole.height), pinhole.calibration_matrix()) if _fits(camera, pinhole) else None
-    )
+    lens = Lens(camera, (pinhole.width, pinhole.height), pinhole.calibration_matrix())
+    return lens if _fits(lens) else None
 
 
 def _options() -> pycolmap.UndistortCameraOptions:
@@ -132,14 +111,12 @@ def _options() -> pycolmap.UndistortCameraOptions:
     )
 
 
-def _fits(camera: pycolmap.Camera, pinhole: pycolmap.Camera) -> bool:
+def _fits(lens: Lens) -> bool:
     """True where the photo of a camera fills the pinhole image, and shows none of it mirrored."""
-    sides = (camera.width, camera.height)
-    x, y = (np.linspace(0.0, side, GRID) for side in (pinhole.width, pinhole.height))
-    K = pinhole.calibration_matrix()
+    sides, K, (x, y) = lens.photo_size, lens.K, (np.linspace(0.0, side, GRID) for side in lens.size)
     rays = np.stack([*np.meshgrid((x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]), np.ones((GRID, GRID))], axis=-1)
     with np.errstate(all="ignore"):
-        places = np.asarray(camera.img_from_cam(rays.reshape(-1, 3)))  # NaN where there is none
+        places = np.asarray(lens.camera.img_from_cam(rays.reshape(-1, 3)))  # NaN where there is none
         least, most = places.min(axis=0), places.max(axis=0)  # NaN fits nowhere
         fits = (least >= -EDGE) & (most <= np.add(sides, EDGE)) & (most - least >= np.multiply(SMALLEST_SHARE, sides))
         places = places.reshape(GRID, GRID, 2)
@@ -152,8 +129,7 @@ def undistortion_note(lenses: Sequence[Lens | None]) -> str:
     """One line on the photos of these lenses, one each, that were undistorted; empty where none was."""
     if not (bent := [lens for lens in lenses if lens is not None]):
         return ""
-    different = {id(lens): lens for lens in bent}
-    first = bent[0]
+    first, others = bent[0], len(set(map(id, bent))) - 1
     photo, image = ("x".join(map(str, size)) for size in (first.photo_size, first.size))
-    more = f", and {len(different) - 1} more cameras" if len(different) > 1 else ""
-    return f"{len(bent)} photos undistorted: {first.model} {photo} -> PINHOLE {image}{more}"
+    more = f", and {others} more cameras" if others else ""
+    return f"{len(bent)} photos undistorted: {first.camera.model.name} {photo} -> PINHOLE {image}{more}"

@@ -87,7 +87,7 @@ class TrainConfig:
         init_world: coordinates of a model's file: ``capture``, the capture's own, or ``gsplat``, the normalised world
             of gsplat's example trainer. Also for a model that eval, render, export or view is given with a capture.
         refine_cameras: train with cameras that agree better with the points that photos show: each photo has a pose,
-            focal lengths and a principal point of its own (`turbogs_plugin.captures.camera_refinement`). Nothing
+            focal lengths and a principal point of its own (`turbogs_plugin.captures.bundle_adjustment`). Nothing
             where the capture does not say which photos show a point, as COLMAP does. Test photos keep their cameras.
         sh_degree: highest degree of the spherical harmonics.
         sh_interval: iterations between two bands; a run starts with band 0, unless from a model's file.

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from turbogs_plugin.captures.camera_json import number_of, opengl_viewmat, pinhole, read_frames
-from turbogs_plugin.captures.capture import LARGEST_SIDE
+from turbogs_plugin.captures.transforms import number_of, opengl_viewmat, pinhole, read_frames
+from turbogs_plugin.captures.undistort import LARGEST_SIDE
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.placement import out_of_nerfstudio, read_json
 from turbogs_plugin.scene import Scene

@@ -95,7 +95,7 @@ def write_refined(scene: Path, out: Path) -> str:
 def _required_observations(model: Path, capture: Capture) -> Observations:
     """The places where photos show points. Raises `InputError` where a capture cannot be refined."""
     names = capture.names
-    if bent := [lens.model for lens in capture.lenses if lens is not None]:
+    if bent := [lens.camera.model.name for lens in capture.lenses if lens is not None]:
         raise InputError(
             f"{model}: {len(bent)} of {len(names)} cameras have distortion ({bent[0]}), and refined cameras are "
             "pinholes: undistort the capture first by 'colmap image_undistorter', then use what that writes"

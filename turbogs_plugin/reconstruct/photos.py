@@ -17,7 +17,7 @@ from PIL.ExifTags import IFD, Base
 
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, require_printable
 from turbogs_plugin.captures.decoding import decoding_threads, opened_image, require_8_bits
-from turbogs_plugin.captures.kinds import run_folder
+from turbogs_plugin.captures.load import run_folder
 from turbogs_plugin.captures.mask_files import FOLDER, mask_finder, require_mask_size
 from turbogs_plugin.captures.photo_files import find_photos, unread
 from turbogs_plugin.errors import InputError

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import torch
 
-from turbogs_plugin.captures.camera_refinement import find_cameras, with_cameras
+from turbogs_plugin.captures.bundle_adjustment import find_cameras, with_cameras
 from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.sections import SceneConfig

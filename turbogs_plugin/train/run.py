@@ -10,8 +10,8 @@ from pathlib import Path
 
 import torch
 
-from turbogs_plugin.captures.camera_refinement import refine_cameras
-from turbogs_plugin.captures.kinds import holds_photos_alone
+from turbogs_plugin.captures.bundle_adjustment import refine_cameras
+from turbogs_plugin.captures.load import holds_photos_alone
 from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, resolve
 from turbogs_plugin.device import free_bytes
 from turbogs_plugin.distributed.ranks import ONE, Ranks
