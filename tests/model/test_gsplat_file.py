@@ -6,8 +6,8 @@ import torch
 from helpers.models import random_gaussians
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.gsplat_file import read_gsplat, save_gsplat
 from turbogs_plugin.model.similarity import Similarity, placed
+from turbogs_plugin.model.torch_file import read_gsplat, save_gsplat
 from turbogs_plugin.scene import Frame
 
 

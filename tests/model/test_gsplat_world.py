@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from turbogs_plugin.model.gsplat_world import HALF_TURNS, gsplat_worlds
+from turbogs_plugin.model.placement import HALF_TURNS, gsplat_worlds
 from turbogs_plugin.scene.geometry import look_at
 
 # examples/datasets/normalize.py of gsplat at 90d7b4b3, on the cameras and points below.

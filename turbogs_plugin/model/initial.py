@@ -36,9 +36,8 @@ def gaussians_from_points(
         points: [M, 3] float, finite.
         colors: [M, 3] uint8.
         sh_degree: highest degree to allocate, 0 .. 3.
-        extent: the scene's, in the points' unit; gives the smallest scale where points coincide.
-        opacity: opacity of every Gaussian, within (0, 1).
-        size: factor of the scales.
+        extent: the scene's, in the points' unit.
+        opacity: of every Gaussian, within (0, 1).
 
     Raises:
         InputError: fewer than two points.
@@ -47,11 +46,9 @@ def gaussians_from_points(
     if count < 2:
         raise InputError(f"there are too few points to start from: {count}")
     scales = (size * mean_neighbor_distances(points, neighbors=3)).clamp(min=SMALLEST_SCALE * extent).log()
-    quats = points.new_zeros(count, 4)
-    quats[:, 0] = 1.0
     return Gaussians(
         means=points.clone(),
-        quats=quats,
+        quats=points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
         scales=scales[:, None].repeat(1, 3),
         opacities=points.new_full((count,), math.log(opacity / (1.0 - opacity))),
         sh0=((colors.to(points).clamp(min=DARKEST) / 255.0 - 0.5) / SH_C0)[:, None, :],
@@ -60,15 +57,8 @@ def gaussians_from_points(
 
 
 def backdrop_gaussians(color: Tensor, sh_degree: int, extent: float) -> Gaussians:
-    """A sphere of one colour around the scene and all cameras, seen where the model has nothing else.
-
-    Without it, such pixels are black. Its Gaussians lie on a Fibonacci lattice and train like all others.
-
-    Args:
-        color: [3] float, 0 .. 1, for instance the mean of the photos.
-        sh_degree: highest degree to allocate, 0 .. 3.
-        extent: the scene's.
-    """
+    """A sphere of one colour ([3] float, 0 .. 1) around the scene and all cameras, seen where the model has nothing
+    else, which would be black. Its Gaussians lie on a Fibonacci lattice and train like all others."""
     index = torch.arange(BACKDROP_COUNT, dtype=torch.float64) + 0.5
     height = 1.0 - 2.0 * index / BACKDROP_COUNT
     angle = index * math.pi * (1.0 + math.sqrt(5.0))

@@ -23,9 +23,7 @@ def in_order_of_space(update: RowUpdate, gaussians: Gaussians, step: Step) -> Ro
     `Step.refine_until` the change stays as it is: Gaussians are then only removed, which leaves the others in order.
 
     Args:
-        update: a change of `gaussians`.
         gaussians: the model before the change, with the cameras' centre as origin.
-        step: the time of the change.
     """
     if step.iteration > step.refine_until:
         return update
@@ -33,7 +31,7 @@ def in_order_of_space(update: RowUpdate, gaussians: Gaussians, step: Step) -> Ro
 
 
 def spatial_order(means: Tensor, extent: float) -> Tensor:
-    """Rows in Morton order (Morton 1966, "A computer oriented geodetic data base").
+    """[N] int64: rows in Morton order (Morton 1966, "A computer oriented geodetic data base").
 
     Coordinates are first mapped by x / (extent + |x|), so that every point has a place, however far away. Ties keep
     their order, and points that are not finite are among the last. Does not wait for the GPU.
@@ -41,9 +39,6 @@ def spatial_order(means: Tensor, extent: float) -> Tensor:
     Args:
         means: [N, 3] float.
         extent: the scene's, in the unit of `means`; at this distance cells are four times as large as at the origin.
-
-    Returns:
-        [N] int64, a permutation.
     """
     contracted = means / (extent + means.abs())  # [N, 3], within (-1, 1)
     cells = ((contracted.double() + 1.0) * 2.0 ** (BITS - 1)).nan_to_num(2.0**BITS, 2.0**BITS)
