@@ -31,7 +31,7 @@ def ring(angles, target=(1.0, 2.0, 0.5), radius=3.0) -> Cameras:
 def test_a_path_goes_through_its_keys_at_even_speed():
     keys = ring(np.linspace(0, 2, 5))
     viewmats = keys.viewmats.double().numpy()
-    made = interpolated(viewmats, K, (48, 40), 81)
+    made = interpolated(viewmats, K, np.array([48, 40]), 81)
     assert len(made) == 81
     assert np.allclose(made.viewmats[::20].numpy(), viewmats, atol=1e-5)
     steps = np.linalg.norm(np.diff(made.centers.double().numpy(), axis=0), axis=1)
@@ -42,7 +42,7 @@ def test_a_path_goes_through_its_keys_at_even_speed():
 def test_rotations_are_halfway_and_cameras_of_one_place_turn():
     viewmats = np.tile(np.eye(4), (2, 1, 1))
     viewmats[1, :3, :3] = Rotation.from_euler("y", 0.8).as_matrix()
-    made = interpolated(viewmats, K, (48, 40), 3)
+    made = interpolated(viewmats, K, np.array([48, 40]), 3)
     half = Rotation.from_euler("y", 0.4).as_matrix()
     assert np.allclose(made.viewmats[1, :3, :3].numpy(), half, atol=1e-6)
 

@@ -10,8 +10,7 @@ from helpers.models import random_gaussians
 
 from turbogs_plugin.engine.reference.projection import rotation_matrices
 from turbogs_plugin.engine.reference.spherical_harmonics import evaluate
-from turbogs_plugin.export.scene_files import save_glb, save_usda
-from turbogs_plugin.export.splat_file import save_splat
+from turbogs_plugin.export.scene_files import save_glb, save_splat, save_usda
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.types import Gaussians
 

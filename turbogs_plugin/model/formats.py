@@ -13,17 +13,18 @@ from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.types import Gaussians
 
 Write = Callable[[Gaussians, Path, Frame, int, bool], None]
-"""Writes a model to a new file, whole or not at all, in the capture's own coordinates (`in_capture`, with its errors).
-It is given the frame of the model's coordinates, the iterations of its training and whether it is drawn with
-antialiasing, and leaves out what the format has no place for."""
+"""Writes a model to a file, whole or not at all, in the capture's own coordinates (`in_capture`, with its errors): of
+the frame of the model's coordinates, the iterations of its training and whether it is drawn with antialiasing, what the
+format has a place for."""
+Read = Callable[[Path], Gaussians]
+"""Reads a model in float64, in the file's own coordinates. Raises `InputError`."""
 
 
 class Format(NamedTuple):
-    """A format of files. `read` gives the model in float64, in the file's own coordinates; `is_antialiased` is what a
-    file that was read says of it."""
+    """A format of files. `is_antialiased` is what a file that was read says of it."""
 
     write: Write
-    read: Callable[[Path], Gaussians]
+    read: Read
     is_antialiased: Callable[[Path], bool] = lambda path: False
 
 

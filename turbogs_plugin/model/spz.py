@@ -35,8 +35,8 @@ ANTIALIASED, EXTENDED = 1, 2
 """Flags: drawn with antialiasing; records of other makers follow (in version 4, before the table)."""
 MOST_FRACTIONAL_BITS = 20
 COLOR_SCALE, SH_SCALE = 0.15, 128.0
-"""Bytes are colours times 255 * 0.15, and harmonics times 128. Niantic's writer drops three or four of their eight bits,
-by which the small coefficients of a capture whose cameras look one way all became 0."""
+"""Bytes are colours times 255 * 0.15, and harmonics times 128. Niantic's writer drops three or four of the latter's
+bits, by which the small coefficients of a capture whose cameras look one way all became 0."""
 SIZE, SIGN, UNIT = 511, 512, 511 * math.sqrt(2.0)
 """Bits of a quaternion's stored component, its sign's, and its code where it were 1; it is at most 1 / sqrt(2)."""
 MOST_UNPACKED, ALWAYS_UNPACKED = 16, 2**20
