@@ -37,7 +37,7 @@ PHOTOS, MODEL = "images", "sparse"
 
 
 def write_refined(scene: Path, out: Path) -> str:
-    """Write a COLMAP capture with the refined cameras and points of another: ``sparse/0``, and links to its photos, their
+    """Write a COLMAP capture with the refined cameras and points of another: ``sparse/0``, and links to its photos, to
     reduced copies (``images_2``, ...) and masks. Points, colours, features and tracks stay, under their identifiers.
 
     Args:
@@ -99,7 +99,7 @@ def write_refined(scene: Path, out: Path) -> str:
 
 
 def _reconstruction(model: Path, suffix: str, capture: Capture, refined: Refinement) -> pycolmap.Reconstruction:
-    """The reconstruction in `model`, from which a capture was read, with the refined cameras, and points in the order of
+    """The reconstruction in `model`, from which a capture was read, with refined cameras, and points in the order of
     their identifiers."""
     pycolmap = load_pycolmap()
     old, new = read_reconstruction(model, suffix), pycolmap.Reconstruction()

@@ -47,11 +47,7 @@ class Picture(str, Enum):
 
 @dataclass(frozen=True)
 class CaptureViews:
-    """The views of a capture under one numbering: training views, then test views.
-
-    Args:
-        train, test: cameras and photos, wherever their photos are kept.
-    """
+    """The views of a capture under one numbering: training views, then test views; wherever their photos are kept."""
 
     train: PosedImages
     test: PosedImages
@@ -108,7 +104,7 @@ def draw(state: ModelState, picture: Picture, camera: ViewerCamera, view: int = 
         draw_view = {Picture.COMPARE: _compare, Picture.SAMPLES: _samples, Picture.AGES: _ages}.get(picture, _errors)
         return _centred(draw_view(state, camera, number), camera), _capture(state).name(number)
     except AbsentError as reason:
-        return np.full((camera.height, camera.width, 3), BACKGROUND, dtype=np.uint8), str(reason)
+        return _centred(torch.zeros(0, 0, 3), camera), str(reason)
 
 
 def shown_view(state: ModelState, picture: Picture, view: int) -> int:
@@ -121,8 +117,7 @@ def shown_view(state: ModelState, picture: Picture, view: int) -> int:
 
 
 def _render(state: ModelState, camera: ViewerCamera) -> np.ndarray:
-    cameras = camera.cameras(state.gaussians.device)
-    return to_uint8(render_image(state.gaussians, cameras, **state.look.options).colors)
+    return to_uint8(render_image(state.gaussians, camera.cameras(state.gaussians.device), **state.look.options).colors)
 
 
 def _compare(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
@@ -180,8 +175,7 @@ def _photo(state: ModelState, views: PosedImages, view_id: int) -> Tensor:
 
 def _map_picture(shares: Tensor, size: np.ndarray, camera: ViewerCamera) -> Tensor:
     """A map [H * W] of a view of (width, height), in colours; what is reduced keeps its largest values."""
-    plane = shares.view(1, int(size[1]), int(size[0]))
-    return colored(_fitted(plane, camera, keep_largest=True)[0])
+    return colored(_fitted(shares.view(1, size[1], size[0]), camera, keep_largest=True)[0])
 
 
 def _fitted(planes: Tensor, camera: ViewerCamera, keep_largest: bool = False) -> Tensor:
