@@ -19,7 +19,7 @@ from turbogs_plugin.export.camera_path import focus_and_up
 from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.types import SH_C0, Cameras, Color, Gaussians
 from turbogs_plugin.viewer.camera import ViewerCamera
-from turbogs_plugin.viewer.server import quiet_server, stop
+from turbogs_plugin.viewer.server import quiet_server
 
 MOST_DIRECTIONS = 24
 """Training cameras, evenly spread, whose colours are averaged."""
@@ -46,8 +46,7 @@ def page_gaussians(model: Gaussians, cameras: Cameras, sh_degree: int) -> Gaussi
 
 def html_page(gaussians: Gaussians, cameras: Cameras, background: Color, title: str, caption: str) -> str:
     """The page of a model of `page_gaussians`, under a line of title and caption; it begins at the first camera."""
-    server = quiet_server("127.0.0.1", 0)
-    try:
+    with quiet_server("127.0.0.1", 0) as server:
         focus, up = focus_and_up(cameras)
         first = ViewerCamera.of_view(cameras, 0)
         server.scene.set_up_direction(up)
@@ -66,8 +65,6 @@ def html_page(gaussians: Gaussians, cameras: Cameras, background: Color, title: 
             opacities=_numpy(torch.sigmoid(gaussians.opacities))[:, None],
         )
         page = server.scene.as_html(dark_mode=max(background) < 0.5)
-    finally:
-        stop(server)
     style = "position:fixed;z-index:9;left:0;right:0;margin:.5em;font:13px sans-serif;color:#888;pointer-events:none"
     head = f'<div style="{style}"><b>{escape(title)}</b> {escape(caption)}</div>'
     page = page.replace("<title>Viser</title>", f"<title>{escape(title)}</title>", 1)

@@ -32,14 +32,13 @@ class Neighbours:
 
 
 def neighbours(names: Iterable[str], known: Sequence[str], photos: Sequence[str]) -> Neighbours:
-    """The nearest known photos before and after each photo; none is its own neighbour.
+    """The nearest known photos before and after each of `photos`; none is its own neighbour.
 
     The photos of one folder are taken for one sequence: cameras, and programs that cut videos, number what they write.
 
     Args:
         names: of all photos, with their folders. Their order is by folder, and numbers in them count as numbers.
         known: names of the photos of which something is known.
-        photos: names of those whose neighbours are wanted.
     """
     ordered = sorted(set(names), key=_key)
     places = {name: place for place, name in enumerate(ordered)}

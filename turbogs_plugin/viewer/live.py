@@ -55,7 +55,7 @@ class LiveViewer(Listener):
         """Show the model after the training until Ctrl-C."""
         trainer = self.trainer
         assert trainer is not None, "no training was watched"
-        self.page.finished()
+        self.page.training.visible = False
         serve_until_interrupted(self.page, lambda: self._serve(trainer, running=False))
 
     def _hold(self, loop: TrainingLoop) -> None:

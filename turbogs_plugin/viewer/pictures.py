@@ -95,25 +95,19 @@ def draw(state: ModelState, picture: Picture, camera: ViewerCamera, view: int = 
 
     Args:
         camera: the page's camera; its size is the picture's.
-        view: number of a view of the capture, see `CaptureViews`; taken within its bounds.
+        view: number of a view of the capture, see `CaptureViews`; taken within its bounds. Samples are shown where they
+            fell: in this view if it was sampled in this iteration, else in the first one that was.
     """
     try:
         if picture is Picture.RENDER:
             return _render(state, camera), ""
-        number = shown_view(state, picture, view)
+        number = min(max(0, view), len(_capture(state)) - 1)
+        if picture is Picture.SAMPLES and state.samples is not None and number not in state.samples.view_ids:
+            number = state.samples.view_ids[0]
         draw_view = {Picture.COMPARE: _compare, Picture.SAMPLES: _samples, Picture.AGES: _ages}.get(picture, _errors)
         return _centred(draw_view(state, camera, number), camera), _capture(state).name(number)
     except AbsentError as reason:
         return _centred(torch.zeros(0, 0, 3), camera), str(reason)
-
-
-def shown_view(state: ModelState, picture: Picture, view: int) -> int:
-    """The view that a picture of a view shows. Samples are shown where they fell: in the chosen view if it was sampled
-    in this iteration, else in the first one that was."""
-    view = min(max(0, view), len(_capture(state)) - 1)
-    if picture is Picture.SAMPLES and state.samples is not None and view not in state.samples.view_ids:
-        return state.samples.view_ids[0]
-    return view
 
 
 def _render(state: ModelState, camera: ViewerCamera) -> np.ndarray:
@@ -125,7 +119,7 @@ def _compare(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
     views, view_id = _capture(state).find(number)
     views = views.with_cameras_on(state.gaussians.device)
     image = render_view(state.gaussians, views, view_id, state.look)
-    pixels = strip(_photo(state, views, view_id), image, views.mask(view_id))
+    pixels = strip(_photo(state, number), image, views.mask(view_id))
     return _fitted(pixels.permute(2, 0, 1).float(), camera).permute(1, 2, 0).round().byte()
 
 
@@ -147,7 +141,7 @@ def _samples(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
     samples = state.samples
     if samples is None:
         raise AbsentError("No samples yet: they are drawn by a running training.")
-    photo = _photo(state, *_capture(state).find(number))
+    photo = _photo(state, number)
     sampled = torch.zeros_like(photo[..., 0])  # [H, W]
     chosen = samples.view_of_slot() == samples.view_ids.index(number)
     sampled.view(-1)[samples.pixel_ids[chosen & samples.filled].long()] = 1.0
@@ -168,8 +162,9 @@ def _maps(state: ModelState, number: int) -> tuple[ErrorMaps, Step]:
     return state.maps
 
 
-def _photo(state: ModelState, views: PosedImages, view_id: int) -> Tensor:
+def _photo(state: ModelState, number: int) -> Tensor:
     """A photo on the model's device, [H, W, 3] float32, 0 .. 1."""
+    views, view_id = _capture(state).find(number)
     return views.photos.image(view_id, state.look.background).to(state.gaussians.device)
 
 

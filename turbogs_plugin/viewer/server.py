@@ -34,9 +34,10 @@ POLL_SECONDS = 0.02
 INSTALL = 'pip install "viser>=1.1,<2"'
 
 
-def quiet_server(host: str, port: int) -> viser.ViserServer:
-    """A viser server that says nothing on standard output, which is the command's, and answers to its own names alone
-    (`_guarded`). Port 0 takes any free one.
+@contextlib.contextmanager
+def quiet_server(host: str, port: int) -> Iterator[viser.ViserServer]:
+    """While entered, a viser server that says nothing on standard output, which is the command's, and answers to its
+    own names alone (`_guarded`). Port 0 takes any free one.
 
     Raises:
         InputError: viser is not installed, or no server can listen there (viser itself would take another port).
@@ -53,13 +54,11 @@ def quiet_server(host: str, port: int) -> viser.ViserServer:
     with contextlib.redirect_stdout(io.StringIO()), _guarded(host):
         server: Any = viser.ViserServer(host=host, port=port, label="TurboGS", verbose=False)
     server.request_share_url = lambda *arguments, **options: None  # a tunnel into the internet
-    return server
-
-
-def stop(server: viser.ViserServer) -> None:
-    """End a server without a word on standard output."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
+    try:
+        yield server
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
 
 
 def quoted(name: str) -> str:
@@ -76,12 +75,14 @@ class Page:
     Attributes:
         paused: whether the training is asked to wait. It waits only while a page is open.
         steps: iterations that a paused training is asked for.
+        training: the controls of a training.
     """
 
     def __init__(self, host: str, port: int, training: bool = False) -> None:
         self.capture: CaptureViews | None = None
         self.frames = Frames(self._send, self.wish)
-        self.server = quiet_server(host, port)
+        self._opened = contextlib.ExitStack()
+        self.server = self._opened.enter_context(quiet_server(host, port))
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self.server.gui.main_panel.dock_right()
         host = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
@@ -92,8 +93,8 @@ class Page:
         self._pictures = gui.add_dropdown("Picture", names, initial_value=names[0])
         self._slider = gui.add_slider("View", 0, 1, 1, 0, visible=False)
         self._there = gui.add_button("Stand at this view", visible=False)
-        self._training = gui.add_folder("Training", visible=training)
-        with self._training:
+        self.training = gui.add_folder("Training", visible=training)
+        with self.training:
             self._pause = gui.add_button("Pause")
             self._step = gui.add_button("One step")
         self._there.on_click(lambda _: self.go_to(self._slider.value))
@@ -104,7 +105,6 @@ class Page:
 
     @property
     def watched(self) -> bool:
-        """Whether anybody looks."""
         return bool(self.server.get_clients())
 
     def wish(self) -> tuple[Picture, int]:
@@ -152,13 +152,9 @@ class Page:
             views, view_id = self.capture.find(number)
             self.stand_at(ViewerCamera.of_view(views.cameras, view_id))
 
-    def finished(self) -> None:
-        """Hide the controls of a training that has ended."""
-        self._training.visible = False
-
     def close(self) -> None:
         """Turn everybody away."""
-        stop(self.server)
+        self._opened.close()
 
     # viser runs asynchronous functions one after the other, in the order of the clicks; others in any order.
     async def _pause_clicked(self, event: object) -> None:
@@ -238,8 +234,8 @@ def _guarded(host: str) -> Iterator[None]:
 
 
 def serve_until_interrupted(page: Page, serve: Callable[[], bool]) -> None:
-    """Say on standard output where the page is, and serve it until Ctrl-C. `serve` draws a frame if one is due, and says
-    whether it did."""
+    """Say on standard output where the page is, and serve it until Ctrl-C: `serve` draws a frame if one is due, and
+    says whether it did."""
     with contextlib.suppress(KeyboardInterrupt):
         print(f"viewer  {page.url}  (Ctrl-C ends)", flush=True)
         while True:
