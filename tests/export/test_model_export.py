@@ -52,11 +52,9 @@ def test_a_capture_far_from_its_origin_is_exported_about_another(turbogs, finish
     model = load_pycolmap().Reconstruction(moved / "sparse/0")
     model.transform(load_pycolmap().Sim3d(1.0, load_pycolmap().Rotation3d(), np.array([5e5, 5.4e6, 300.0])))
     model.write(moved / "sparse/0")
-    given = ("--scene", moved, "--format", name, "--out", file)
-    far = tmp_path / "far.ply"
-    frame = load_scene(moved).frame
+    far, frame = tmp_path / "far.ply", load_scene(moved).frame
     save_ply(load_model(finished, torch.device("cpu")).gaussians, far, frame)
-    code, out, err = turbogs("export", far, *given)
+    code, out, err = turbogs("export", far, "--scene", moved, "--format", name, "--out", file)
     assert code == 0 and re.search(r"about the local origin (499|500)\d{3} 5\d{6} \d+", out), (out, err)
     before, after = map(float, re.search(r"PSNR   ([\d.]+) -> ([\d.]+) dB", out).groups())
     assert abs(before - after) < (1 if name in LOSSY else 0.01)
@@ -153,8 +151,7 @@ def test_a_film_that_cannot_be_made_is_refused(turbogs, finished, tmp_path, monk
 
 
 def test_a_film_has_the_background(model, scene, tmp_path):
-    ffmpeg = pytest.importorskip("imageio_ffmpeg")
-    look = replace(model.own_look(), background=WHITE)
+    ffmpeg, look = pytest.importorskip("imageio_ffmpeg"), replace(model.own_look(), background=WHITE)
     empty = model.gaussians.map(lambda value: value[:0])
     renders.write_film(empty, look, through_views(scene.train.cameras, 3), tmp_path / "a.mp4")
     _, frame, *_ = ffmpeg.read_frames(str(tmp_path / "a.mp4"))
