@@ -30,9 +30,7 @@ WIDEST_FILM = 1920
 
 def focus_and_up(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """The point nearest to all lines of sight (least squares), [3], and the mean upward direction, [3], a unit vector.
-
-    Where the lines are parallel, or meet behind the cameras, the point is one unit in front of their mean.
-    """
+    Where the lines are parallel, or meet behind the cameras, the point is one unit in front of their mean."""
     centers, directions = (value.double().cpu().numpy() for value in (cameras.centers, cameras.directions))
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # [C, 3, 3]
     matrix = across.mean(axis=0)
@@ -73,14 +71,12 @@ def through_views(cameras: Cameras, frames: int) -> Cameras:
 
 
 def from_file(path: Path, scene: Scene, frames: int) -> Cameras:
-    """A smooth way through the cameras of a file: of the layout of ``transforms.json`` (``w``, ``h``, ``fl_x`` or
-    ``camera_angle_x``, of all or of each frame, and a ``transform_matrix`` each, from camera to world, in the capture's
-    own coordinates and OpenGL's axes), of nerfstudio's viewer (``camera_path``, in nerfstudio's world if its
-    `TRANSFORMS` lies beside the file), or Inria's ``cameras.json``. The film has the first camera's size.
+    """A smooth way through the cameras of a file; the film has the first one's size.
 
-    Raises:
-        InputError: no such file, or not such a one.
-    """
+    The file is of the layout of ``transforms.json`` (``w``, ``h``, ``fl_x`` or ``camera_angle_x``, of all or of each
+    frame, and a ``transform_matrix`` each, from camera to world, in the capture's own coordinates and OpenGL's axes),
+    of nerfstudio's viewer (``camera_path``, in nerfstudio's world if its `TRANSFORMS` lies beside the file), or Inria's
+    ``cameras.json``. Raises `InputError` where it is none of these."""
     content, changes = parse_json(text_of(path), str(path)), []
     if isinstance(content, list) and content and all(isinstance(entry, dict) for entry in content):
         entries = [_of_inria(entry, f"{path}: camera {place}") for place, entry in enumerate(content)]
@@ -147,14 +143,13 @@ def _of_inria(entry: dict[str, Any], owner: str) -> dict[str, Any]:
 
 
 def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: np.ndarray, frames: int) -> Cameras:
-    """Cameras at even steps of a smooth way through others: centres on a cubic Hermite spline whose tangents are
-    central differences, rotations by slerp, intrinsics linearly.
+    """`frames` cameras at even steps of a smooth way through others: centres on a cubic Hermite spline whose tangents
+    are central differences, rotations by slerp, intrinsics linearly.
 
     Args:
         viewmats: [C, 4, 4] float64, world to camera.
         Ks: [C, 3, 3] float64, or [3, 3] of all.
         size: (width, height) of the film.
-        frames: at least 1.
     """
     from scipy.interpolate import CubicHermiteSpline
     from scipy.spatial.transform import Rotation, Slerp

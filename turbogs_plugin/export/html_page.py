@@ -30,12 +30,8 @@ WIDEST = 25.0
 
 
 def page_gaussians(model: Gaussians, cameras: Cameras, sh_degree: int) -> Gaussians:
-    """A model whose Gaussians have the one colour each that they have on the page; without higher bands.
-
-    Args:
-        cameras: of the training views.
-        sh_degree: highest degree in use.
-    """
+    """A model whose Gaussians have the one colour each that they have on the page, by the cameras of the training
+    views; without higher bands. `sh_degree`: the highest degree in use."""
     chosen = evenly(len(cameras), MOST_DIRECTIONS)
     colors = torch.zeros_like(model.means)  # [N, 3]
     for center in cameras.centers[chosen].to(model.means):

@@ -40,10 +40,6 @@ def write_refined(scene: Path, out: Path) -> str:
     """Write a COLMAP capture with the refined cameras and points of another: ``sparse/0``, and links to its photos, to
     reduced copies (``images_2``, ...) and masks. Points, colours, features and tracks stay, under their identifiers.
 
-    Args:
-        scene: folder of a COLMAP capture.
-        out: new folder; it appears when all of it is written.
-
     Returns:
         Lines for the user: what is unusual about the capture, if anything is; how many cameras were refined, with the
         median errors in pixels before and after; where it was written.

@@ -45,7 +45,6 @@ def render_run(
 
     Args:
         path: folder of the run, or the file of a model.
-        split: test or train.
         with_depth: also write each view's expected depth along the camera's axis, in the capture's own units, 0 where
             nothing was hit: as ``.npy`` ([H, W] float32) and as a coloured PNG (`depth_picture`).
         given: the capture of a model from a file, and how to render it; None: `path` is a run.
@@ -91,16 +90,8 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
 def film_run(
     path: Path, camera_path: str, video: Path, seconds: float, device_name: str, given: Config | None = None
 ) -> Path:
-    """Write a film of a run's newest model or of a given one into a new file.
-
-    Args:
-        path: folder of the run, or the file of a model.
-        camera_path: orbit, views, or a file of cameras.
-        given: the capture of a model from a file, and how to render it; None: `path` is a run.
-
-    Raises:
-        InputError: an option does not fit, no such model, or no usable capture.
-    """
+    """Write a film of a run's newest model or of a given one into a new file, along orbit, views, or a file of cameras.
+    Arguments and errors as of `render_run`; `InputError`, too, where an option does not fit."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise InputError(f"a film needs imageio-ffmpeg: {INSTALL}")
     if not 0 < seconds <= 3600:
@@ -120,10 +111,9 @@ def film_run(
 
 
 def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) -> None:
-    """Render and encode a film. Nothing is left behind where this fails.
+    """Render a model, as it looks, and encode a film. Nothing is left behind where this fails.
 
     Args:
-        look: how the model is shown, without exposures.
         cameras: of the frames, all of one size; an odd side loses a pixel, which the encoder needs.
         video: a new file, whose suffix says which container.
 

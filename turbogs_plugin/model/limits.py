@@ -29,15 +29,10 @@ RESTRAIN_EVERY = 10
 
 @dataclass(frozen=True)
 class Clearance:
-    """A sphere around each training camera that is kept free of Gaussians.
+    """A sphere around each training camera, at `centers` [V, 3] and of `radii` [V], that is kept free of Gaussians.
 
     Faint Gaussians before a camera cost it little, but veil a test view from there: a haze that no training view
-    corrects.
-
-    Args:
-        centers: [V, 3] the cameras' places.
-        radii: [V] of the spheres.
-    """
+    corrects."""
 
     centers: Tensor
     radii: Tensor
@@ -80,17 +75,13 @@ def _distances(points: Tensor, centers: Tensor) -> Iterator[Tensor]:
 
 @torch.no_grad()
 def restrain_distant(gaussians: Gaussians, extent: float, size: float) -> None:
-    """Limit the size of Gaussians beyond `DISTANT` extents, in place, to a share of their distance from all cameras.
+    """Limit the size of Gaussians beyond `DISTANT` extents, in place: the ratio of a standard deviation to the distance
+    from the nearest place of a camera is at most `size`. The cameras' centre is the origin, and all lie within an
+    extent.
 
     A Gaussian beside a camera reaches the middle of the image, whatever its depth and perhaps in front of everything,
     once its deviation is a third of its distance (splats are cut at 3.33): size and place of a splat are both divided
-    by the depth. It may happen that no training view shows it.
-
-    Args:
-        gaussians: the model, with the cameras' centre as origin.
-        extent: the scene's; all cameras lie within it.
-        size: largest allowed ratio of a standard deviation to the distance from the nearest place of a camera.
-    """
+    by the depth. It may happen that no training view shows it."""
     distances = gaussians.means.norm(dim=-1, keepdim=True)  # [N, 1]
     limits = torch.where(distances > DISTANT * extent, (size * (distances - extent)).log(), torch.inf)
     torch.minimum(gaussians.scales, limits, out=gaussians.scales)

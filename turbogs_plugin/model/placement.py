@@ -51,15 +51,9 @@ or scaled about their middle, 0.2 to 0.9 and 0.14 to 1.9. Of a model that was cu
 def nearest_change(
     gaussians: Gaussians, changes: list[Similarity], points: np.ndarray, colors: np.ndarray
 ) -> tuple[Similarity, bool]:
-    """The change by which a capture's points and a model's Gaussians lie nearest to one another, in place and colour,
-    and whether the model fits the points then.
-
-    Args:
-        gaussians: float64; rows may be not finite.
-        changes: from the model's coordinates to the capture's own; at least one.
-        points: [M, 3] float64, in the capture's own coordinates; M >= 1.
-        colors: [M, 3] uint8 of the points.
-    """
+    """The change, of those from a model's coordinates to its capture's own, by which points ([M, 3] float64, M >= 1,
+    and [M, 3] uint8) and Gaussians (float64, perhaps not finite) lie nearest to one another, in place and colour; and
+    whether the model fits the points then."""
     from scipy.spatial import cKDTree
 
     every = slice(None, None, -(-len(points) // POINTS_AT_MOST))
@@ -101,13 +95,8 @@ def out_of_nerfstudio(file: Path) -> list[Similarity]:
 
 
 def gsplat_worlds(viewmats: np.ndarray, points: np.ndarray) -> list[Similarity]:
-    """The four changes from a capture's own coordinates into what may be gsplat's normalised world; none where the
-    cameras or points do not determine it.
-
-    Args:
-        viewmats: [V, 4, 4] float64 world to camera, of all images.
-        points: [M, 3] float64, of the reconstruction.
-    """
+    """The four changes from a capture's own coordinates into what may be gsplat's normalised world, by the world to
+    camera matrices [V, 4, 4] of all images and the points [M, 3], float64; none where these do not determine it."""
     from scipy.spatial.transform import Rotation
 
     centers, axes = camera_centers(viewmats), viewmats[:, :3, :3]  # rows of a rotation: right, down, forward

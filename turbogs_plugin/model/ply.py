@@ -55,15 +55,10 @@ def save_ply(
 
 
 def read_ply(path: Path) -> Gaussians:
-    """Read a model from a .ply with the properties of 3DGS; others are ignored but the ``filter_3D`` of Mip-Splatting,
-    which is fused into scales and opacities (Yu et al. 2024, equation 7).
-
-    Returns:
-        float64, on the CPU, in the file's own coordinates; rows may be not finite.
-
-    Raises:
-        InputError: the file is not such a .ply, lacks a property, or has no Gaussian.
-    """
+    """A model from a .ply with the properties of 3DGS, in the file's own coordinates; float64, on the CPU, perhaps with
+    rows that are not finite. Other properties are ignored but the ``filter_3D`` of Mip-Splatting, which is fused into
+    scales and opacities (Yu et al. 2024, equation 7). Raises `InputError` where the file is not such a .ply, lacks a
+    property, or has no Gaussian."""
     vertices = read_vertices(path)
     rest = sum(name.startswith("f_rest_") for name in vertices)
     if rest not in [3 * each for each in BANDS]:

@@ -25,13 +25,7 @@ OPAQUE, FLAT = 20.0, -20.0
 
 @dataclass(frozen=True)
 class Similarity:
-    """``new = scale * rotation @ old + translation``, in float64.
-
-    Args:
-        rotation: [3, 3], with determinant 1.
-        scale: positive.
-        translation: [3].
-    """
+    """``new = scale * rotation @ old + translation``, in float64: [3, 3], a positive number, and [3]."""
 
     rotation: np.ndarray
     scale: float
@@ -76,20 +70,10 @@ class Similarity:
 
 
 def placed(gaussians: Gaussians, change: Similarity, source: Path) -> Gaussians:
-    """A file's model in other coordinates, as training and rendering take it.
+    """A file's model (float64), changed, as training and rendering take it: float32, on the CPU.
 
-    Args:
-        gaussians: float64, as the file has them. Infinite opacities and scales of 0 become finite. Those that are not
-            finite are left out, with a warning that counts them, and with one that counts flat ones.
-        change: from the file's coordinates.
-        source: the file, for messages.
-
-    Returns:
-        float32, on the CPU.
-
-    Raises:
-        InputError: no Gaussian is finite.
-    """
+    Infinite opacities and scales of 0 become finite; Gaussians that are not finite are left out. Warnings about the
+    file `source` count flat ones and these. Raises `InputError` where none is left."""
     if count := int((flat := gaussians.scales == -math.inf).any(dim=1).sum()):
         warnings.warn(f"{source}: {count} Gaussians are flat (scale 0, as of 2DGS) and drawn thin", stacklevel=3)
     opacities = gaussians.opacities.where(~gaussians.opacities.isinf(), OPAQUE * gaussians.opacities.sign())
@@ -101,14 +85,8 @@ def in_capture(gaussians: Gaussians, frame: Frame, target: Path, double_means: b
     """A model as files have it: in the capture's own coordinates, float32 on the CPU; means in float64 if
     `double_means`, which a frame far from the capture's origin needs (`local_origin`).
 
-    Args:
-        gaussians: those that are not finite are left out, with a warning that counts them.
-        frame: of the model's coordinates.
-        target: the file, for messages.
-
-    Raises:
-        InputError: none is left.
-    """
+    Gaussians that are not finite are left out; a warning about the file `target` counts them. Raises `InputError` where
+    none is left."""
     rows = gaussians.map(lambda value: value.detach().cpu().contiguous())
     means = torch.from_numpy(frame.restore_points(rows.means.numpy()))
     means = means if double_means else means.float()

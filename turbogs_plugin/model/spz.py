@@ -78,12 +78,9 @@ def is_antialiased_spz(path: Path) -> bool:
 
 
 def read_spz(path: Path) -> Gaussians:
-    """A model in x right, y down, z forward; float64, on the CPU.
-
-    Raises:
-        InputError: the file is not a whole one of this format, of version 4 where zstandard is not installed, or
-            unpacks to more than `MOST_UNPACKED` times its bytes, or than the memory takes.
-    """
+    """A model in x right, y down, z forward; float64, on the CPU. Raises `InputError` where the file is not a whole one
+    of this format, needs zstandard (version 4), or unpacks to more than `MOST_UNPACKED` times its bytes, or than the
+    memory takes."""
     version, bits, (means, opacities, colors, scales, rotations, harmonics) = _unpacked(path)
     if version == 1:
         warnings.warn(f"{path} is of version 1, which has positions in half precision: export it again", stacklevel=2)

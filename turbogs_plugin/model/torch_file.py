@@ -39,13 +39,7 @@ def read_plain(path: Path, name: str, remedy: str = "") -> Any:
     untrusted source can neither run code nor take more memory than some 100 bytes for each of its own, nor work without
     end. Tensors of one that is large beside the free memory are read from the disk as they are used.
 
-    Args:
-        name: of the file, for messages.
-        remedy: what to do about a file that cannot be used.
-
-    Raises:
-        InputError: the file cannot be read, or used.
-    """
+    Raises `InputError` about the file, called `name`, where it cannot be read or used, with the `remedy`."""
     try:
         _require_bounded(path)
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=too_large(os.path.getsize(path)))
@@ -145,18 +139,9 @@ def save_gsplat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, a
 
 
 def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:
-    """The model in a state that gsplat's trainer saved, in the file's own coordinates.
-
-    Args:
-        state: plain tensors and values, with ``splats``.
-        path: the file, for messages.
-
-    Returns:
-        float64, on the CPU; rows may be not finite.
-
-    Raises:
-        InputError: parameters are missing, or of other shapes.
-    """
+    """The model in a state that gsplat's trainer saved, in the file's own coordinates; float64, on the CPU, perhaps
+    with rows that are not finite. Raises `InputError`, about the file `path`, where parameters are missing or of other
+    shapes."""
     splats = state["splats"] if isinstance(state["splats"], Mapping) else {}
     if missing := [name for name in PARAMETER_NAMES if not isinstance(splats.get(name), Tensor)]:
         present = ", ".join(sorted(map(str, splats))[:8]) or "nothing"
