@@ -20,16 +20,9 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 def viewmat_of_pose(axes: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """[4, 4] float64 world to camera of a camera's place in the world.
-
-    Args:
-        axes: [3, 3] float64, whose columns are the camera's axes in the world: right, down, forward. Decimals that were
-            cut when it was written are made up for: the nearest rotation is taken.
-        center: [3] float64.
-
-    Raises:
-        ValueError: the numbers are not finite, or the axes not a rotation.
-    """
+    """[4, 4] float64 world to camera of a camera's place `center` [3] in the world, and its axes there, right, down,
+    forward: the columns of `axes` [3, 3]. Decimals that were cut when they were written are made up for: the nearest
+    rotation is taken. Raises `ValueError` for numbers that are not finite, and axes that are no rotation."""
     if not (np.isfinite(axes).all() and np.isfinite(center).all()):
         raise ValueError("has numbers that are not finite")
     with np.errstate(over="ignore", invalid="ignore"):

@@ -45,8 +45,7 @@ class ViewWindow:
 
     Args:
         stores: arrays of one length [X, ...] in host memory. They are page-locked where they lie while the window
-            exists, if there is a GPU to do that; without, and where they lie in files, copies are slower and all else
-            is the same.
+            exists, if there is a GPU to do that; without, and where they lie in files, copies are slower.
         sizes: [V, 2] int64 numpy array (width, height) of the views laid end to end in them.
         device: of the window. On a CPU, copies are made at once.
         written: the arrays are changed in the window, so views travel back as well.
@@ -261,11 +260,7 @@ def place_views(views: PosedImages, device: torch.device, place: str) -> PosedIm
 
 
 class _CopyStream:
-    """Copies in one direction, beside the computation; on a CPU, at once.
-
-    Attributes:
-        latest: the end of the copies begun so far; empty where there were none.
-    """
+    """Copies in one direction, beside the computation; on a CPU, at once. `latest` is the end of those begun so far."""
 
     def __init__(self, device: torch.device) -> None:
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
@@ -303,11 +298,9 @@ def _wait(device: torch.device, events: Sequence[torch.cuda.Event]) -> None:
 
 
 def _page_lock(window: ViewWindow) -> None:
-    """Lock the stores in memory, in place, until the window is gone.
-
-    torch's own pinned memory would be a copy, rounded up to a power of two. Memory that another window has locked stays
-    as that one has it. A file's is left alone: locked, all of it would have to be in memory.
-    """
+    """Lock the stores in memory, in place, until the window is gone: torch's own pinned memory would be a copy, rounded
+    up to a power of two. Memory that another window has locked stays as that one has it. A file's is left alone:
+    locked, all of it would have to be in memory."""
     runtime = torch.cuda.cudart()
     locked = []
     for store in window.stores:

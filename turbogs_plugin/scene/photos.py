@@ -23,7 +23,7 @@ class Photos:
     Args:
         colors: [X, 3] uint8, row-major pixels of one view after the other. Or [X, 4] where photos are transparent:
             colours times alpha, and alpha; the background shows through them.
-        sizes: [V, 2] int64 numpy array (width, height).
+        sizes: [V, 2] int64, (width, height).
     """
 
     colors: Tensor

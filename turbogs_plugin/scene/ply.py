@@ -20,11 +20,8 @@ class _AsciiLines(io.BufferedReader):
 def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
     """The ``vertex`` element of a .ply: property -> [N] values in the file's own type, in the file's order.
 
-    trimesh allocates nothing before the file is known to be long enough for what its header announces.
-
-    Raises:
-        InputError: no such file, not a .ply, or a header or a body that is not as announced.
-    """
+    trimesh allocates nothing before the file is known to be long enough for what its header announces. Raises
+    `InputError` where there is no such file, or its header or body is not as announced."""
     from trimesh.exchange.ply import load_ply  # its import takes a second
 
     try:

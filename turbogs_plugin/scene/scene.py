@@ -44,8 +44,7 @@ class PosedImages:
         photos: their pixels.
         masks: which pixels count, on the CPU; None for all.
         observations: where the photos show the scene's points; None: the capture does not say.
-        refined: other cameras of the same photos, which agree better with what is trained on (`refine_cameras`); None:
-            there are none.
+        refined: other cameras of the photos, which agree better with what is trained on (`refine_cameras`), if any.
     """
 
     cameras: Cameras

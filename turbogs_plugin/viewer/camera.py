@@ -22,13 +22,12 @@ FOV_LIMITS = (math.radians(1.0), math.radians(170.0))
 
 @dataclass(frozen=True)
 class ViewerCamera:
-    """A pinhole camera whose principal point is the middle of its image.
+    """A pinhole camera whose principal point is the middle of its image of `width` and `height` pixels.
 
     Args:
         position: in the model's world.
         wxyz: unit quaternion of the rotation from the camera (x right, y down, z forward) to the world.
         fov: vertical, radians.
-        width, height: of the image, pixels.
     """
 
     position: tuple[float, float, float]
@@ -71,7 +70,7 @@ class ViewerCamera:
 
     @property
     def rotation(self) -> np.ndarray:
-        """The rotation from the camera to the world, [3, 3] float64."""
+        """[3, 3] float64, from the camera to the world."""
         return rotation_matrices(torch.tensor(self.wxyz, dtype=torch.float64)).numpy()
 
     def with_at_most(self, pixels: float) -> ViewerCamera:

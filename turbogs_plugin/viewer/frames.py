@@ -29,14 +29,11 @@ FEWEST_PIXELS = 160 * 120
 
 class Frames:
     """Draws the frames that are due, one a call, on the thread that calls. All pages show what the camera that moved
-    last sees.
+    last sees. `about` is a line about the last frame.
 
     Args:
         send: encodes a picture [H, W, 3] uint8, without loss or not, and sends it.
         wish: gives the picture and the view that the pages show.
-
-    Attributes:
-        about: a line about the last frame.
     """
 
     def __init__(

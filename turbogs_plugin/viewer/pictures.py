@@ -25,8 +25,7 @@ from turbogs_plugin.viewer.camera import ViewerCamera
 
 BACKGROUND = 24
 """Grey level where a picture has nothing to show."""
-DIMMED = 0.4
-"""Brightness of what is there for orientation only."""
+DIMMED = 0.4  # of what is there for orientation only
 SAMPLED = (255, 170, 0)
 
 
@@ -73,7 +72,6 @@ class ModelState:
     Args:
         gaussians: the model, on the device that renders.
         look: how it is shown, without exposures.
-        capture: its views, for training and for testing.
         maps: errors and ages of the training views, and the time from which ages count.
         samples: pixels of the last iteration.
     """
