@@ -57,13 +57,10 @@ def test_a_browser_shows_the_model_and_turns_it(model, scene, tmp_path):
         assert tab.title() == "a <model>"
         tab.add_style_tag(content=".mantine-Notifications-root { display: none }")
 
-        def seen() -> np.ndarray:
-            picture = tab.locator("canvas").first.screenshot(timeout=PATIENCE)
-            return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
-
         def comes(condition) -> np.ndarray:
             for _ in range(100):
-                if condition(image := seen()):
+                picture = tab.locator("canvas").first.screenshot(timeout=PATIENCE)
+                if condition(image := np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)):
                     return image
                 tab.wait_for_timeout(200)
             pytest.fail("the model was not shown")

@@ -36,12 +36,9 @@ def test_other_starts():
     torch.testing.assert_close(torch.sigmoid(small.opacities), torch.full((50,), 0.5))
 
 
-def test_coincident_points_get_a_scale():
+def test_coincident_points_get_a_scale_and_no_points_are_refused():
     same = gaussians_from_points(torch.ones(5, 3), torch.zeros(5, 3, dtype=torch.uint8), sh_degree=0, extent=2.0)
     assert same.scales.exp().flatten().tolist() == pytest.approx([2e-4] * 15) and same.shN.shape == (5, 0, 3)
-
-
-def test_no_points_are_refused():
     with pytest.raises(InputError, match="too few points"):
         gaussians_from_points(torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.uint8), 3, 1.0)
 

@@ -38,20 +38,15 @@ def test_single_points_count_neither_for_a_camera_nor_for_all():
     assert radii[1].item() == pytest.approx(1.0, rel=1e-5)  # farther from every point than from 0.9 of its own
 
 
-def test_too_few_points_say_nothing():
-    assert Clearance.of(torch.zeros(POINTS - 1, 3), CENTERS) is None
-
-
-def test_pieces_change_nothing(monkeypatch):
+def test_pieces_change_nothing_and_too_few_points_say_nothing(monkeypatch):
     points = torch.rand(500, 3, generator=torch.Generator().manual_seed(1)) * 4
-    whole = Clearance.of(points, CENTERS)
-    monkeypatch.setattr(limits, "DISTANCES_AT_ONCE", 14)
-    pieces = Clearance.of(points, CENTERS)
-    assert torch.equal(whole.radii, pieces.radii)
-    gaussians = random_gaussians(300)
-    assert torch.equal(
-        whole.clear(unchanged(gaussians), gaussians).source, pieces.clear(unchanged(gaussians), gaussians).source
-    )
+    gaussians, made = random_gaussians(300), []
+    for at_once in (limits.DISTANCES_AT_ONCE, 14):
+        monkeypatch.setattr(limits, "DISTANCES_AT_ONCE", at_once)
+        made.append(Clearance.of(points, CENTERS))
+        made.append(made[-1].clear(unchanged(gaussians), gaussians).source)
+    assert torch.equal(made[0].radii, made[2].radii) and torch.equal(made[1], made[3]) and 0 < len(made[1]) < 300
+    assert Clearance.of(torch.zeros(POINTS - 1, 3), CENTERS) is None
 
 
 def test_rows_in_a_sphere_are_taken_out_of_a_change():
@@ -71,19 +66,12 @@ def test_rows_in_a_sphere_are_taken_out_of_a_change():
 
 
 def test_a_change_without_rows_in_a_sphere_is_returned_as_it_is():
-    gaussians = random_gaussians(5)
+    """Means that are not finite are left to others."""
+    gaussians, spheres = random_gaussians(5), Clearance(CENTERS, torch.ones(2))
     gaussians.means += 100.0
-    update = unchanged(gaussians)
-    assert Clearance(CENTERS, torch.ones(2)).clear(update, gaussians) is update
-    none = RowUpdate(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool), {})
-    assert Clearance(CENTERS, torch.ones(2)).clear(none, gaussians) is none
-
-
-def test_a_mean_that_is_not_finite_is_left_to_others():
-    gaussians = random_gaussians(3)
-    gaussians.means[:] = torch.tensor([[torch.nan, 0, 0], [torch.inf, 0, 0], [0.1, 0, 0]])
-    cleared = Clearance(CENTERS, torch.ones(2)).clear(unchanged(gaussians), gaussians)
-    assert cleared.source.tolist() == [0, 1]
+    gaussians.means[:2] = torch.tensor([[torch.nan, 0, 0], [torch.inf, 0, 0]])
+    for update in (unchanged(gaussians), unchanged(random_gaussians(0))):
+        assert spheres.clear(update, gaussians) is update
 
 
 def test_distant_gaussians_are_restrained_and_the_scene_is_not():

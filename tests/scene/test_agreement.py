@@ -19,8 +19,10 @@ def scene(tmp_path_factory) -> Scene:
     return load_scene(write_demo_capture(tmp_path_factory.mktemp("demo") / "capture", views=8, width=64, height=48))
 
 
-def posed(scene: Scene, viewmats: torch.Tensor | np.ndarray) -> Scene:
-    cameras = Cameras(torch.as_tensor(viewmats).float(), scene.train.cameras.Ks, scene.train.cameras.sizes)
+def posed(scene: Scene, viewmats: torch.Tensor | np.ndarray, unit: torch.Tensor | float = 1.0) -> Scene:
+    """The scene with other poses, and intrinsics over this unit."""
+    given = scene.train.cameras
+    cameras = Cameras(torch.as_tensor(viewmats).float(), given.Ks / unit, given.sizes)
     return replace(scene, train=replace(scene.train, cameras=cameras))
 
 
@@ -31,9 +33,7 @@ def inverted(scene: Scene) -> Scene:
 
 
 def shares(scene: Scene) -> Scene:
-    Ks = scene.train.cameras.Ks / torch.tensor([[64.0], [48.0], [1.0]])
-    cameras = Cameras(scene.train.cameras.viewmats, Ks, scene.train.cameras.sizes)
-    return replace(scene, train=replace(scene.train, cameras=cameras))
+    return posed(scene, scene.train.cameras.viewmats, torch.tensor([[64.0], [48.0], [1.0]]))
 
 
 def transparent(scene: Scene) -> Scene:
@@ -41,14 +41,16 @@ def transparent(scene: Scene) -> Scene:
     return replace(scene, train=replace(scene.train, photos=Photos(torch.zeros(len(photos.colors), 4), photos.sizes)))
 
 
+def foreign(scene: Scene, doubt: str = "") -> Scene:
+    """The scene with points of another one."""
+    return replace(scene, point_colors=scene.point_colors.flip(0), doubt=doubt)
+
+
 CONTRADICTIONS = {
     "other axes": (lambda s: posed(s, OTHER_AXES @ s.train.cameras.viewmats.double().numpy()), "columns 2 and 3"),
     "inverse poses": (inverted, "invert each pose"),
-    "points of another scene": (lambda s: replace(s, point_colors=s.point_colors.flip(0)), "of one solve"),
-    "stale frames": (
-        lambda s: replace(s, point_colors=s.point_colors.flip(0), doubt="poses of frames"),
-        "poses of frames",
-    ),
+    "points of another scene": (foreign, "of one solve"),
+    "stale frames": (lambda s: foreign(s, "poses of frames"), "poses of frames"),
     "points far away": (lambda s: replace(s, points=s.points + 100.0), "cameras see no points: .*one frame"),
     "intrinsics in shares": (shares, "in pixels"),
     "no alpha": (transparent, "alpha 0"),
@@ -77,7 +79,7 @@ def test_good_captures_pass_by_a_wide_margin(scene):
 
 
 def test_what_cannot_be_told_passes(scene):
-    other = replace(scene, point_colors=scene.point_colors.flip(0))
+    other = foreign(scene)
     require_agreement(replace(other, point_colors=torch.full_like(scene.point_colors, 128)))  # clouds without colours
     require_agreement(replace(other, points=scene.points[:40], point_colors=other.point_colors[:40]))
     require_agreement(replace(other, points=scene.points + 100.0, drawn_points=True))

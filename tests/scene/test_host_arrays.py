@@ -49,30 +49,18 @@ def test_what_fits_on_no_disk_is_refused(little_memory, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("files", "left"),
+    ("groups", "left"),
     [
         ({}, 8000 * 1024),
-        ({"fs/cgroup/a/memory.max": "max", "fs/cgroup/memory.max": "5000", "fs/cgroup/memory.current": "1000"}, 4000),
-        (
-            {
-                "fs/cgroup/a/memory.max": "3000",
-                "fs/cgroup/a/memory.current": "2900",
-                "fs/cgroup/a/memory.stat": "anon 2000\ninactive_file 800\nactive_file 7",
-            },
-            900,
-        ),
-        ({"fs/cgroup/memory.max": "700", "fs/cgroup/memory.current": "900"}, 0),
+        ({"a/memory.max": "max", "memory.max": "5000", "memory.current": "1000"}, 4000),
+        ({"a/memory.max": "3000", "a/memory.current": "2900", "a/memory.stat": "anon 2000\ninactive_file 800"}, 900),
+        ({"memory.max": "700", "memory.current": "900"}, 0),
     ],
 )
-def test_free_memory_is_that_of_the_container(monkeypatch, tmp_path, files, left):
-    written = {
-        "proc/meminfo": "MemTotal: 9000 kB\nMemAvailable: 8000 kB",
-        "proc/self/cgroup": "1:name=systemd:/c\n0::/a",
-        **files,
-    }
-    monkeypatch.setattr(
-        host_arrays, "_lines", lambda path: written.get(str(path).lstrip("/").removeprefix("sys/"), "").splitlines()
-    )
+def test_free_memory_is_that_of_the_container(monkeypatch, groups, left):
+    written = {f"/sys/fs/cgroup/{name}": text for name, text in groups.items()}
+    written |= {"/proc/meminfo": "MemTotal: 9000 kB\nMemAvailable: 8000 kB", "/proc/self/cgroup": "1:name=b:/c\n0::/a"}
+    monkeypatch.setattr(host_arrays, "_lines", lambda path: written.get(str(path), "").splitlines())
     assert host_arrays.free_host_bytes() == left
 
 

@@ -3,6 +3,7 @@
 import random
 from collections import deque
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -48,9 +49,8 @@ def test_training_is_bit_for_bit_that_of_resident_maps_and_photos(scene, capture
     assert len(offloaded.maps.errors) < len(resident.maps.errors)  # a window, not all of it
     assert len(offloaded.views.photos.colors) < len(resident.views.photos.colors)
     places = offloaded.maps.offsets
-    assert np.array_equal(places, offloaded.views.photos.offsets)  # so that one kernel can use both,
-    assert len(offloaded.maps.errors) == len(offloaded.views.photos.colors)  # which it checks
-    assert (places != ABSENT).sum() == 4
+    assert np.array_equal(places, offloaded.views.photos.offsets) and (places != ABSENT).sum() == 4  # one kernel uses
+    assert len(offloaded.maps.errors) == len(offloaded.views.photos.colors)  # both, and checks that
 
 
 def test_a_run_stops_with_resident_maps_and_goes_on_with_offloaded_ones(scene, capture):
@@ -117,35 +117,27 @@ class Machine:
     def enqueue(self, stream: str, work) -> None:
         self.streams.setdefault(stream, deque()).append(work)
 
-    def record(self, stream: str):
-        event = {"done": False}
-        self.enqueue(stream, lambda: event.update(done=True))
-        return _Event(event)
+    def record(self, stream: str) -> Event:
+        event = Event()
+        self.enqueue(stream, event.set)
+        return event
 
     def wait(self, stream: str, events) -> None:
         for event in events:
             self.enqueue(stream, event)
 
-    def run(self, steps: int | None = None) -> None:
-        """So much of what is enqueued; None: all of it."""
-        while steps is None or steps > 0:
-            ready = [
-                queue
-                for queue in self.streams.values()
-                if queue and not (isinstance(queue[0], _Event) and not queue[0].state["done"])
-            ]
+    def run(self, steps: float = np.inf) -> None:
+        """At most `steps` of what is enqueued. An event that is not set stops its stream."""
+        while steps > 0:
+            queues = [queue for queue in self.streams.values() if queue]
+            ready = [queue for queue in queues if not isinstance(queue[0], Event) or queue[0].is_set()]
             if not ready:
-                assert not any(self.streams.values()), "the streams wait for each other"
+                assert not queues, "the streams wait for each other"
                 return
             work = self.choose.choice(ready).popleft()
-            if not isinstance(work, _Event):
+            if not isinstance(work, Event):
                 work()
-            steps = None if steps is None else steps - 1
-
-
-class _Event:
-    def __init__(self, state: dict) -> None:
-        self.state = state
+            steps -= 1
 
 
 @pytest.fixture
@@ -183,20 +175,18 @@ def machine(monkeypatch):
 @pytest.mark.parametrize("seed", range(8))
 def test_no_copy_is_too_early_or_too_late(machine, seed, written):
     """Work on the window, and copies in and out, in any order that the events allow: what a plain array gives."""
-    gpu, choose = machine(seed), random.Random(seed)
-    starts = pixel_offsets(SIZES)
+    gpu, choose, starts = machine(seed), random.Random(seed), pixel_offsets(SIZES)
     truth = torch.arange(int(starts[-1]), dtype=torch.int64)
     window = ViewWindow((truth.clone(),), SIZES, CPU, written=written)
     seen = []
 
     def work(place: int, start: int, end: int, amount: int) -> None:
-        array = window.arrays[0]  # as the kernels get it: the waiting is enqueued before the work
+        inside = window.arrays[0][place:][: end - start]  # as kernels get it: the waiting is enqueued before the work
         expected = truth[start:end].clone()
 
         def change() -> None:
-            inside = array[place : place + end - start]
             seen.append(torch.equal(inside, expected))
-            inside += amount if written else 0
+            inside.add_(amount if written else 0)
 
         gpu.enqueue("compute", change)
         truth[start:end] += amount if written else 0

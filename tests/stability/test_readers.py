@@ -19,8 +19,8 @@ from PIL import Image
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.gsplat_file import save_gsplat
 from turbogs_plugin.model.ply import save_ply
+from turbogs_plugin.model.torch_file import save_gsplat
 from turbogs_plugin.scene import Frame, Scene
 from turbogs_plugin.train.training_state import initial_gaussians
 from turbogs_plugin.types import Gaussians

@@ -22,8 +22,7 @@ from turbogs_plugin.engine.reference.projection import drawable_rows, project_ro
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model import placement
-from turbogs_plugin.model.gsplat_world import gsplat_worlds
-from turbogs_plugin.model.placement import TRANSFORMS, TURNS
+from turbogs_plugin.model.placement import TRANSFORMS, TURNS, gsplat_worlds
 from turbogs_plugin.model.ply import read_ply, save_ply
 from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.model.spz import save_spz

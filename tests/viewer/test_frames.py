@@ -1,5 +1,7 @@
 """When frames are drawn: nothing for nobody, nothing twice, lossless at rest, within the share of a training."""
 
+from unittest.mock import MagicMock
+
 import numpy as np
 import pytest
 import torch
@@ -18,11 +20,7 @@ NOTHING = ModelState(EMPTY, Look(0, DEFAULT_SETTINGS))
 
 
 class Desk:
-    """Frames under a clock that only a test and drawing move.
-
-    Args:
-        per_pixel: seconds of a pixel.
-    """
+    """Frames under a clock that only a test and drawing move, by `per_pixel` seconds."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, per_pixel: float = 0.0) -> None:
         self.now = 100.0
@@ -49,14 +47,10 @@ class Desk:
         self.now += seconds
 
 
-def test_without_a_usable_camera_nothing_is_drawn(monkeypatch):
+def test_moving_frames_are_small_files_and_the_last_one_is_lossless(monkeypatch):
     desk = Desk(monkeypatch)
     desk.frames.look(None)
     assert not desk.frames.serve(lambda: pytest.fail("a state was asked for"), 0, True)
-
-
-def test_moving_frames_are_small_files_and_the_last_one_is_lossless(monkeypatch):
-    desk = Desk(monkeypatch)
     desk.look(0.0)
     assert desk.serve() and not desk.sent[-1][1]
     desk.wait(0.05)
@@ -117,11 +111,7 @@ def test_without_a_training_moving_frames_keep_pace_and_the_one_at_rest_is_whole
 
 def test_a_full_device_ends_no_training(monkeypatch):
     desk = Desk(monkeypatch)
-
-    def full(*_: object) -> None:
-        raise torch.cuda.OutOfMemoryError
-
-    monkeypatch.setattr(module, "draw", full)
+    monkeypatch.setattr(module, "draw", MagicMock(side_effect=torch.cuda.OutOfMemoryError))
     desk.look(0.0)
     assert desk.serve() and desk.sent == []
 
@@ -130,11 +120,6 @@ def test_waiting_for_the_training_is_no_cost_of_a_frame(monkeypatch):
     """What `serve` is given may wait for iterations under way; the share is of the time that drawing takes."""
     desk = Desk(monkeypatch, per_pixel=1e-6)
     desk.look(0.0)
-
-    def drained() -> ModelState:
-        desk.wait(1.0)
-        return NOTHING
-
-    assert desk.frames.serve(drained, 0, True)
+    assert desk.frames.serve(lambda: desk.wait(1.0) or NOTHING, 0, True)
     width, _ = desk.sent[-1]
     assert desk.frames.next_at == pytest.approx(101.0 + 1e-6 * width * width * 3 / 4 / SHARE)

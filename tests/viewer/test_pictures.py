@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.models import random_gaussians
 
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS
 from turbogs_plugin.report.images import GAP, strip, to_uint8
 from turbogs_plugin.train.look import Look
-from turbogs_plugin.types import BLACK, Color, Gaussians, PixelSamples, Step
+from turbogs_plugin.types import BLACK, Color, PixelSamples, Step
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.pictures import BACKGROUND, SAMPLED, ModelState, Picture, draw
 
@@ -25,22 +26,13 @@ def own_size(state: ModelState, width: int = 1, extra: int = 0) -> ViewerCamera:
     return replace(camera, width=width * camera.width + extra)
 
 
-def spots(*places: tuple[float, float, float], background: Color = BLACK) -> ModelState:
-    """A small opaque grey ball at each place."""
-    count = len(places)
-    balls = Gaussians(
-        means=torch.tensor(places, dtype=torch.float32),
-        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
-        scales=torch.full((count, 3), -3.0),
-        opacities=torch.full((count,), 5.0),
-        sh0=torch.zeros(count, 1, 3),
-        shN=torch.zeros(count, 0, 3),
-    )
-    return ModelState(balls, Look(0, DEFAULT_SETTINGS, background))
+def nothing(background: Color = BLACK) -> ModelState:
+    """A model without Gaussians and capture."""
+    return ModelState(random_gaussians(0, 0), Look(0, DEFAULT_SETTINGS, background))
 
 
 def test_the_model_stands_on_the_background():
-    found, _ = draw(spots((0.0, 0.0, -5.0), background=(1.0, 0.0, 0.5)), Picture.RENDER, FLAT)
+    found, _ = draw(nothing((1.0, 0.0, 0.5)), Picture.RENDER, FLAT)
     assert (found == (255, 0, 128)).all()
 
 
@@ -109,8 +101,7 @@ def test_samples_are_shown_where_they_fall(state):
 
 
 def test_a_state_without_what_a_picture_shows_gives_an_empty_one_and_the_reason(state):
-    alone = spots((0.0, 0.0, 2.0))
-    test_view = len(state.capture) - 1
+    alone, test_view = nothing(), len(state.capture) - 1
     absent = [(alone, picture, 0) for picture in Picture if picture is not Picture.RENDER]
     for lacking, picture, view in (*absent, (state, Picture.ERRORS, test_view)):
         found, about = draw(lacking, picture, FLAT, view)

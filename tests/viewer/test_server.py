@@ -10,6 +10,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
+from http.client import HTTPConnection
 from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import urlsplit
@@ -30,7 +31,9 @@ from turbogs_plugin.viewer.server import INSTALL, Page, _own_name
 from turbogs_plugin.viewer.show import open_state
 
 pytest.importorskip("viser")
-ConnectionClosed = pytest.importorskip("websockets.exceptions").ConnectionClosed
+ConnectionClosed, InvalidStatus = (
+    getattr(pytest.importorskip("websockets.exceptions"), name) for name in ("ConnectionClosed", "InvalidStatus")
+)
 
 
 def test_pictures_and_views_are_chosen_on_the_page_and_moving_frames_are_jpeg(shown, state):
@@ -83,16 +86,19 @@ def test_a_hostile_client_ends_nothing(shown, state):
 def test_scripts_of_other_pages_are_turned_away(shown, state):
     camera = ViewerCamera.of_view(state.capture.train.cameras, 0)
     with shown(state) as page:
-        with ViewerClient(page.url, Origin=page.url) as client:
-            client.look(camera)
-            client.next_frame()
-        foreign, local = f"elsewhere.example:{urlsplit(page.url).port}", f"127.0.0.1:{urlsplit(page.url).port}"
-        with ViewerClient(page.url, Host=local, Origin=f"http://{local}") as client:
-            client.look(camera)
-            client.next_frame()
+        port = urlsplit(page.url).port
+        foreign, local = f"elsewhere.example:{port}", f"127.0.0.1:{port}"
+        for headers in ({"Origin": page.url}, {"Host": local, "Origin": f"http://{local}"}):
+            with ViewerClient(page.url, **headers) as client:
+                client.look(camera)
+                client.next_frame()
         for headers in ({}, {"Host": foreign}):  # a name of theirs that leads here is the second
-            with pytest.raises(ConnectionClosed):
-                ViewerClient(page.url, Origin=f"http://{foreign}", **headers).next_frame(timeout=10.0)
+            with pytest.raises(InvalidStatus, match="403"):
+                ViewerClient(page.url, Origin=f"http://{foreign}", **headers)
+        for name, status in ((local, 200), (foreign, 403)):
+            with closing(HTTPConnection("127.0.0.1", port)) as asked:
+                asked.request("GET", "/", headers={"Host": name})
+                assert asked.getresponse().status == status
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ def export(
             splat: one colour each.
             glb: glTF with KHR_gaussian_splatting. usda: OpenUSD's ParticleField3DGaussianSplat.
             html: a page with the model to turn in a browser, without a network.
-        out: new file; model.ply, model.pt, ..., or model.html in the run's folder where absent.
+        out: new file; export.ply, model.pt, ..., or model.html in the run's folder where absent.
         max_gaussians: largest number of Gaussians; those are kept that add most to the training views.
         cameras: give each photo of a capture a refined camera of its own, and write a capture to train on, with
             sparse/0 and links to the photos, into the new folder --out. Trainers must read the principal point of each

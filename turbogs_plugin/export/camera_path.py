@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 import torch
 
+from turbogs_plugin.captures.capture import text_of
 from turbogs_plugin.captures.transforms import number_of, opengl_viewmat, pinhole, read_frames
 from turbogs_plugin.captures.undistort import LARGEST_SIDE
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.placement import out_of_nerfstudio, read_json
+from turbogs_plugin.model.placement import out_of_nerfstudio
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.geometry import camera_centers, evenly, look_at
 from turbogs_plugin.types import Cameras
+from turbogs_plugin.yaml_json import parse_json
 
 MOST_KEYS = 24
 """Largest number of a capture's cameras that a path goes through, evenly spread: more would make it jitter."""
 MOST_POINTS = 1000
 """Points of a capture that tell in which of nerfstudio's worlds a path is."""
-LENS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
-"""Keys of a lens in a ``transforms.json``, of a frame or of all."""
 SWING = math.pi
 """Largest gap in radians between cameras that surround what they look at; beyond it an orbit swings."""
 WIDEST_FILM = 1920
@@ -31,101 +31,83 @@ WIDEST_FILM = 1920
 
 def focus_and_up(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """The point nearest to all lines of sight (least squares), [3], and the mean upward direction, [3], a unit vector.
-
-    Where the lines are parallel, or meet behind the cameras, the point is one unit in front of their mean.
-    """
+    Where the lines are parallel, or meet behind the cameras, the point is one unit in front of their mean."""
     centers, directions = (value.double().cpu().numpy() for value in (cameras.centers, cameras.directions))
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # [C, 3, 3]
     matrix = across.mean(axis=0)
-    middle = centers.mean(axis=0)
-    ahead = middle + _unit(directions.mean(axis=0), np.array([0.0, 0.0, 1.0]))
+    point = centers.mean(axis=0) + _unit(directions.mean(axis=0), np.array([0.0, 0.0, 1.0]))
     if np.linalg.eigvalsh(matrix)[0] > 1e-3:
-        point = np.linalg.solve(matrix, np.einsum("cij,cj->i", across, centers) / len(centers))
-        if np.median(((point - centers) * directions).sum(axis=1)) > 0:
-            ahead = point
+        nearest = np.linalg.solve(matrix, np.einsum("cij,cj->i", across, centers) / len(centers))
+        if np.median(((nearest - centers) * directions).sum(axis=1)) > 0:
+            point = nearest
     down = cameras.viewmats[:, 1, :3].double().cpu().numpy().mean(axis=0)
-    return ahead, _unit(-down, np.array([0.0, -1.0, 0.0]))
+    return point, _unit(-down, np.array([0.0, -1.0, 0.0]))
 
 
 def orbit(cameras: Cameras, frames: int) -> Cameras:
-    """A circle about what the cameras look at, at their median height and distance; a swing through the angles that
-    they cover, where they do not surround it. It ends where it began.
-
-    Args:
-        cameras: of a capture.
-        frames: of the film, at least 1.
-    """
+    """`frames` cameras on a circle about what a capture's cameras look at, at their median height and distance; a swing
+    through the angles that they cover, where they do not surround it. It ends where it began."""
     focus, up = focus_and_up(cameras)
-    centers = cameras.centers.double().cpu().numpy()
-    offsets = centers - focus
+    offsets = cameras.centers.double().cpu().numpy() - focus
     heights = offsets @ up
     flat = offsets - heights[:, None] * up
     east = _unit(flat.mean(axis=0), _unit(flat[0], np.cross(up, [0.7, 0.1, 0.7])))
     north = np.cross(up, east)
     angles = np.sort(np.arctan2(flat @ north, flat @ east))
-    gaps = np.diff(np.append(angles, angles[0] + 2 * math.pi))
-    widest = int(gaps.argmax())
-    turns = np.arange(frames) / frames
-    if gaps[widest] > SWING:  # from the end of the gap around to its beginning
-        first, reach = angles[(widest + 1) % len(angles)], 2 * math.pi - gaps[widest]
-        course = first + reach * (0.5 - 0.5 * np.cos(2 * math.pi * turns))
-    else:
-        course = angles[0] + 2 * math.pi * turns
+    gaps = np.diff(angles, append=angles[0] + 2 * math.pi)
+    widest, turns = int(gaps.argmax()), 2 * math.pi * np.arange(frames) / frames
+    if gaps[widest] > SWING:  # from the end of the gap around to its beginning, and back
+        turns = (2 * math.pi - gaps[widest]) * (0.5 - 0.5 * np.cos(turns))
+    course = angles[widest + 1 - len(angles)] + turns
     radius = max(float(np.median(np.linalg.norm(flat, axis=1))), 1e-3)
-    places = focus + float(np.median(heights)) * up
-    places = places + radius * (np.cos(course)[:, None] * east + np.sin(course)[:, None] * north)
-    viewmats = np.stack([look_at(place, focus, up) for place in places])
-    K, size = _common_lens(cameras)
-    return _cameras(viewmats, K, size)
+    ring = radius * (np.cos(course)[:, None] * east + np.sin(course)[:, None] * north)
+    places = focus + float(np.median(heights)) * up + ring
+    return _cameras(np.stack([look_at(place, focus, up) for place in places]), *_common_lens(cameras))
 
 
 def through_views(cameras: Cameras, frames: int) -> Cameras:
     """A smooth way through the cameras in their order, at most `MOST_KEYS` of them."""
-    chosen = evenly(len(cameras), MOST_KEYS)
-    keys = cameras.to("cpu").select(chosen)
-    K, size = _common_lens(cameras)
-    return interpolated(keys.viewmats.double().numpy(), K, size, frames)
+    keys = cameras.viewmats[evenly(len(cameras), MOST_KEYS)].double().cpu().numpy()
+    return interpolated(keys, *_common_lens(cameras), frames)
 
 
 def from_file(path: Path, scene: Scene, frames: int) -> Cameras:
-    """A smooth way through the cameras of a file: of the layout of ``transforms.json`` (``w``, ``h``, ``fl_x`` or
-    ``camera_angle_x``, of all or of each frame, and a ``transform_matrix`` each, from camera to world, in the capture's
-    own coordinates and OpenGL's axes), of nerfstudio's viewer (``camera_path``, in nerfstudio's world if its
-    `TRANSFORMS` lies beside the file), or Inria's ``cameras.json``. The film has the first camera's size.
+    """A smooth way through the cameras of a file; the film has the first one's size.
 
-    Raises:
-        InputError: no such file, or not such a one.
-    """
-    content = read_json(path)
+    The file is of the layout of ``transforms.json`` (``w``, ``h``, ``fl_x`` or ``camera_angle_x``, of all or of each
+    frame, and a ``transform_matrix`` each, from camera to world, in the capture's own coordinates and OpenGL's axes),
+    of nerfstudio's viewer (``camera_path``, in nerfstudio's world if its `TRANSFORMS` lies beside the file), or Inria's
+    ``cameras.json``. Raises `InputError` where it is none of these."""
+    content, changes = parse_json(text_of(path), str(path)), []
     if isinstance(content, list) and content and all(isinstance(entry, dict) for entry in content):
-        lenses, poses = _of_inria(content, path)
+        entries = [_of_inria(entry, f"{path}: camera {place}") for place, entry in enumerate(content)]
     elif isinstance(content, dict) and isinstance(content.get("camera_path"), list):
-        lenses, poses = _of_nerfstudio(content, path)
+        entries, changes = _of_nerfstudio(content, path), out_of_nerfstudio(path)
     else:
-        content, entries = read_frames(path)
-        lenses = [{key: each[key] for each in (content, entry) for key in LENS if key in each} for entry in entries]
-        poses = [entry.get("transform_matrix") for entry in entries]
-    Ks: list[np.ndarray] = []
-    size: tuple[int, int] | None = None
-    for place, lens in enumerate(lenses):
-        width, height = (number_of(lens, path, name) for name in ("w", "h"))
-        if not (width and height and 2 <= width <= LARGEST_SIDE and 2 <= height <= LARGEST_SIDE):
-            raise InputError(f"{path}: camera {place} has no size of the film: give w and h in pixels")
-        K = pinhole(lens, path, (width, height))
-        if K is None or K[0, 0] <= 0:
-            raise InputError(f"{path}: camera {place} has neither fl_x nor a camera_angle_x in 0 .. pi")
-        size = size or (round(width), round(height))
-        Ks.append(K * [[size[0] / width], [size[1] / height], [1.0]])
-    if size is None:
+        shared, own = read_frames(path)
+        entries = [shared | entry for entry in own]
+    if not entries:
         raise InputError(f"{path} has no cameras: export the path again")
-    viewmats = np.stack(
-        [opengl_viewmat(pose, f"{path}: the pose of camera {place}") for place, pose in enumerate(poses)]
-    )
-    if isinstance(content, dict) and "camera_path" in content and (changes := out_of_nerfstudio(path)):
+    cameras = [_camera(entry, path, place) for place, entry in enumerate(entries)]
+    viewmats, Ks, sizes = (np.stack(each) for each in zip(*cameras, strict=True))
+    Ks[:, :2] *= (sizes[0] / sizes)[:, :, None]
+    if changes:
         points = scene.frame.restore_points(scene.points[evenly(len(scene.points), MOST_POINTS)].cpu().numpy())
         moved, some = [change.apply_to_poses(viewmats) for change in changes], evenly(len(viewmats), MOST_KEYS)
-        viewmats = max(moved, key=lambda each: _seen(each[some], np.stack(Ks)[some], points))
-    return interpolated(scene.frame.normalise_poses(viewmats), np.stack(Ks), size, frames)
+        viewmats = max(moved, key=lambda each: _seen(each[some], Ks[some], points))
+    return interpolated(scene.frame.normalise_poses(viewmats), Ks, sizes[0], frames)
+
+
+def _camera(values: dict[str, Any], path: Path, place: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """World to camera [4, 4], intrinsics [3, 3] and (width, height) [2] of a frame as ``transforms.json`` has it."""
+    owner = f"{path}: camera {place}"
+    size = [number_of(values, path, name) or 0.0 for name in ("w", "h")]
+    if not all(2 <= side <= LARGEST_SIDE for side in size):
+        raise InputError(f"{owner} has no size of the film: give w and h in pixels")
+    K = pinhole(values, path, (size[0], size[1]))
+    if K is None or K[0, 0] <= 0:
+        raise InputError(f"{owner} has neither fl_x nor a camera_angle_x in 0 .. pi")
+    return opengl_viewmat(values.get("transform_matrix"), f"{path}: the pose of camera {place}"), K, np.array(size)
 
 
 def _seen(viewmats: np.ndarray, Ks: np.ndarray, points: np.ndarray) -> int:
@@ -135,50 +117,44 @@ def _seen(viewmats: np.ndarray, Ks: np.ndarray, points: np.ndarray) -> int:
     return int(((places[:, :, 2] > 0) & (abs(pixels - Ks[:, None, :2, 2]) < Ks[:, None, :2, 2]).all(axis=2)).sum())
 
 
-def _of_nerfstudio(content: dict[str, Any], path: Path) -> tuple[list[dict[str, Any]], list[Any]]:
-    """Lenses, as frames of a ``transforms.json`` have them, and poses of a camera path of nerfstudio's viewer."""
+def _of_nerfstudio(content: dict[str, Any], path: Path) -> list[dict[str, Any]]:
+    """The cameras of a path of nerfstudio's viewer, as frames of a ``transforms.json``."""
     if content.get("camera_type", "perspective") != "perspective":
         raise InputError(f"{path} is of {str(content['camera_type'])[:40]} cameras: a film takes perspective ones")
-    lenses, poses = [], []
+    width, height = (number_of(content, path, f"render_{side}") for side in ("width", "height"))
+    frames = []
     for entry in content["camera_path"]:
         values = entry if isinstance(entry, dict) else {}
-        angle = number_of(values, path, "fov")  # degrees, of the height
-        width, height = (number_of(content, path, f"render_{side}") for side in ("width", "height"))
-        focal = 0.5 * height / math.tan(math.radians(angle) / 2) if height and angle and 0 < angle < 180 else None
-        lenses.append({"w": width, "h": height} | ({} if focal is None else {"fl_x": focal}))
-        matrix = values.get("camera_to_world")
-        poses.append([matrix[row : row + 4] for row in range(0, len(matrix), 4)] if isinstance(matrix, list) else None)
-    return lenses, poses
+        angle = number_of(values, path, "fov") or 0.0  # degrees, of the height
+        focal = 0.5 * height / math.tan(math.radians(angle) / 2) if height and 0 < angle < 180 else None
+        frame = {"w": width, "h": height, "fl_x": focal, "transform_matrix": values.get("camera_to_world")}
+        frames.append({name: value for name, value in frame.items() if value is not None})
+    return frames
 
 
-def _of_inria(content: list[dict[str, Any]], path: Path) -> tuple[list[dict[str, Any]], list[Any]]:
-    """As `_of_nerfstudio`, of the cameras that Inria's trainer writes: OpenCV's axes, a position and a rotation."""
+def _of_inria(entry: dict[str, Any], owner: str) -> dict[str, Any]:
+    """A camera as Inria's trainer writes it (OpenCV's axes, a position and a rotation), as a ``transforms.json``'s."""
     names = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy"}
-    lenses = [{ours: entry[theirs] for ours, theirs in names.items() if theirs in entry} for entry in content]
-    poses = []
-    for place, entry in enumerate(content):
-        try:
-            rotation, position = (np.array(entry[name], dtype=np.float64) for name in ("rotation", "position"))
-            poses.append(np.c_[rotation * [1.0, -1.0, -1.0], position])
-        except (KeyError, TypeError, ValueError):
-            raise InputError(f"{path}: camera {place} has no rotation of 3x3 numbers and position") from None
-    return lenses, poses
+    try:
+        rotation, position = (np.array(entry[name], dtype=np.float64) for name in ("rotation", "position"))
+        pose = np.c_[rotation * [1.0, -1.0, -1.0], position]
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{owner} has no rotation of 3x3 numbers and position") from None
+    return {ours: entry[theirs] for ours, theirs in names.items() if theirs in entry} | {"transform_matrix": pose}
 
 
-def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: tuple[int, int], frames: int) -> Cameras:
-    """Cameras at even steps of a smooth way through others: centres on a cubic Hermite spline whose tangents are
-    central differences, rotations by slerp, intrinsics linearly.
+def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: np.ndarray, frames: int) -> Cameras:
+    """`frames` cameras at even steps of a smooth way through others: centres on a cubic Hermite spline whose tangents
+    are central differences, rotations by slerp, intrinsics linearly.
 
     Args:
         viewmats: [C, 4, 4] float64, world to camera.
         Ks: [C, 3, 3] float64, or [3, 3] of all.
         size: (width, height) of the film.
-        frames: at least 1.
     """
     from scipy.interpolate import CubicHermiteSpline
     from scipy.spatial.transform import Rotation, Slerp
 
-    Ks = np.broadcast_to(Ks, (len(viewmats), 3, 3))
     if len(viewmats) == 1:
         return _cameras(np.repeat(viewmats, frames, axis=0), Ks, size)
     centers, rotations = camera_centers(viewmats), Rotation.from_matrix(viewmats[:, :3, :3])
@@ -192,30 +168,29 @@ def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: tuple[int, int], fr
     made = np.tile(np.eye(4), (frames, 1, 1))
     made[:, :3, :3] = Slerp(times, rotations)(wanted).as_matrix()
     made[:, :3, 3] = -np.einsum("fij,fj->fi", made[:, :3, :3], places)
-    after = np.searchsorted(times, wanted, side="right").clip(1, len(times) - 1)
-    share = ((wanted - times[after - 1]) / (times[after] - times[after - 1]))[:, None, None]
-    return _cameras(made, (1 - share) * Ks[after - 1] + share * Ks[after], size)
+    lenses = np.broadcast_to(Ks, (len(viewmats), 3, 3)).reshape(-1, 9)
+    between = np.stack([np.interp(wanted, times, column) for column in lenses.T], axis=1)
+    return _cameras(made, between.reshape(-1, 3, 3), size)
 
 
-def _common_lens(cameras: Cameras) -> tuple[np.ndarray, tuple[int, int]]:
+def _common_lens(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """Intrinsics [3, 3] with the picture's middle as principal point, and an even (width, height): the median camera's,
     reduced to `WIDEST_FILM`."""
     order = np.argsort(cameras.sizes.prod(axis=1), kind="stable")
     middle = int(order[len(order) // 2])
-    width, height = cameras.sizes[middle].tolist()
-    by = min(1.0, WIDEST_FILM / max(width, height))
-    size = max(2, 2 * int(by * width / 2)), max(2, 2 * int(by * height / 2))
+    by = min(1.0, WIDEST_FILM / cameras.sizes[middle].max())
+    size = np.maximum(2, 2 * (by * cameras.sizes[middle] / 2).astype(np.int64))
     K = cameras.Ks[middle].double().cpu().numpy() * by
     return np.array([[K[0, 0], 0, size[0] / 2], [0, K[1, 1], size[1] / 2], [0, 0, 1.0]]), size
 
 
-def _cameras(viewmats: np.ndarray, Ks: np.ndarray, size: tuple[int, int]) -> Cameras:
-    count = len(viewmats)
-    lenses = torch.from_numpy(np.broadcast_to(Ks, (count, 3, 3)).copy()).float()
-    poses = torch.from_numpy(viewmats).float()
-    return Cameras(poses, lenses, np.tile(np.array(size, dtype=np.int64), (count, 1)))
+def _cameras(viewmats: np.ndarray, Ks: np.ndarray, size: np.ndarray) -> Cameras:
+    lenses = torch.from_numpy(np.broadcast_to(Ks, (len(viewmats), 3, 3)).copy()).float()
+    return Cameras(
+        torch.from_numpy(viewmats).float(), lenses, np.tile(np.rint(size).astype(np.int64), (len(lenses), 1))
+    )
 
 
 def _unit(vector: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    size = np.linalg.norm(vector)
-    return vector / size if size > 1e-9 else otherwise / np.linalg.norm(otherwise)
+    length = np.linalg.norm(vector)
+    return vector / length if length > 1e-9 else otherwise / np.linalg.norm(otherwise)

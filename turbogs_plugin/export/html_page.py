@@ -19,7 +19,7 @@ from turbogs_plugin.export.camera_path import focus_and_up
 from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.types import SH_C0, Cameras, Color, Gaussians
 from turbogs_plugin.viewer.camera import ViewerCamera
-from turbogs_plugin.viewer.server import quiet_server, stop
+from turbogs_plugin.viewer.server import quiet_server
 
 MOST_DIRECTIONS = 24
 """Training cameras, evenly spread, whose colours are averaged."""
@@ -30,13 +30,8 @@ WIDEST = 25.0
 
 
 def page_gaussians(model: Gaussians, cameras: Cameras, sh_degree: int) -> Gaussians:
-    """A model whose Gaussians have the one colour each that they have on the page; without higher bands.
-
-    Args:
-        model: in the scene's frame, on any device; finite, as saved models are.
-        cameras: of the training views.
-        sh_degree: highest degree in use.
-    """
+    """A model whose Gaussians have the one colour each that they have on the page, by the cameras of the training
+    views; without higher bands. `sh_degree`: the highest degree in use."""
     chosen = evenly(len(cameras), MOST_DIRECTIONS)
     colors = torch.zeros_like(model.means)  # [N, 3]
     for center in cameras.centers[chosen].to(model.means):
@@ -46,47 +41,30 @@ def page_gaussians(model: Gaussians, cameras: Cameras, sh_degree: int) -> Gaussi
 
 
 def html_page(gaussians: Gaussians, cameras: Cameras, background: Color, title: str, caption: str) -> str:
-    """The page.
-
-    Args:
-        gaussians: of `page_gaussians`.
-        cameras: of the training views; the page begins at the first one.
-        background: behind the model.
-        title: of the page.
-        caption: a line above the model.
-    """
-    server = quiet_server("127.0.0.1", 0)
-    try:
+    """The page of a model of `page_gaussians`, under a line of title and caption; it begins at the first camera."""
+    with quiet_server("127.0.0.1", 0) as server:
         focus, up = focus_and_up(cameras)
         first = ViewerCamera.of_view(cameras, 0)
         server.scene.set_up_direction(up)
         start = server.initial_camera
-        start.position = MAGNIFICATION * np.array(first.position)
+        start.position, start.far = MAGNIFICATION * np.array(first.position), 1000.0 * MAGNIFICATION
         start.look_at, start.up, start.fov = MAGNIFICATION * focus, up, first.fov
-        start.far = 1000.0 * MAGNIFICATION
-        pixel = np.array(background, dtype=np.float64).reshape(1, 1, 3)
-        server.scene.set_background_image((255.0 * pixel).round().astype(np.uint8), format="png")
+        pixel = np.rint(255.0 * np.array([[background]])).astype(np.uint8)
+        server.scene.set_background_image(pixel, format="png")
+        scales = MAGNIFICATION * gaussians.scales.exp().clamp(max=WIDEST)
+        axes = rotation_matrices(gaussians.quats) * scales[:, None]  # [N, 3, 3]
         server.scene.add_gaussian_splats(
             "/model",
             centers=_numpy(MAGNIFICATION * gaussians.means),
-            covariances=_numpy(MAGNIFICATION**2 * _covariances(gaussians)),
+            covariances=_numpy(axes @ axes.mT),
             rgbs=_numpy(SH_C0 * gaussians.sh0[:, 0] + 0.5).clip(0.0, 1.0),
             opacities=_numpy(torch.sigmoid(gaussians.opacities))[:, None],
         )
         page = server.scene.as_html(dark_mode=max(background) < 0.5)
-    finally:
-        stop(server)
     style = "position:fixed;z-index:9;left:0;right:0;margin:.5em;font:13px sans-serif;color:#888;pointer-events:none"
     head = f'<div style="{style}"><b>{escape(title)}</b> {escape(caption)}</div>'
     page = page.replace("<title>Viser</title>", f"<title>{escape(title)}</title>", 1)
-    before, tag, after = page.partition("<body>")
-    return before + tag + head + after
-
-
-def _covariances(gaussians: Gaussians) -> Tensor:
-    """The covariances of N Gaussians, [N, 3, 3] float32, world units squared."""
-    axes = rotation_matrices(gaussians.quats) * gaussians.scales.exp().clamp(max=WIDEST)[:, None]
-    return axes @ axes.transpose(1, 2)
+    return page.replace("<body>", f"<body>{head}", 1)
 
 
 def _numpy(values: Tensor) -> np.ndarray:

@@ -6,13 +6,11 @@ about a `local_origin`, which is said; the run's own ``model.ply`` has doubles.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,10 +20,9 @@ from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.html_page import html_page, page_gaussians
-from turbogs_plugin.export.scene_files import save_glb, save_usda
-from turbogs_plugin.export.splat_file import read_splat, save_splat
+from turbogs_plugin.export.scene_files import read_splat, save_glb, save_splat, save_usda
 from turbogs_plugin.files import require_new_file, write_text_atomically
-from turbogs_plugin.model.formats import FORMATS
+from turbogs_plugin.model.formats import FORMATS, Read, Write
 from turbogs_plugin.model.similarity import Similarity, local_origin
 from turbogs_plugin.model.spz import VERSION, read_spz, save_spz
 from turbogs_plugin.scene import Frame
@@ -36,27 +33,26 @@ from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.saved_model import load_with_capture
 from turbogs_plugin.types import Cameras, Gaussians
 
-PAGE = "html"
-"""Name of the page with the model to turn, which no program reads back."""
-
 
 class Export(NamedTuple):
-    """A format of exported files: its suffix, how it is written (as `Format.write`) and read again, None where every
-    number is as it was; and whether the file can say that the model is antialiased."""
+    """A format of exported files: its suffix, how it is written and read again, None where every number is as it was;
+    and whether the file can say that the model is antialiased."""
 
     suffix: str
-    write: Callable[[Gaussians, Path, Frame, int, bool], None]
-    read: Callable[[Path], Gaussians] | None = None
+    write: Write
+    read: Read | None = None
     marked: bool = False
 
 
+PAGE = "html"
+"""Name of the page with the model to turn, which is made of more than a model and read by no program."""
 EXPORTS = {
     **{name: Export(name, each.write, each.read, name != "pt") for name, each in FORMATS.items()},
     "spz2": Export("spz", partial(save_spz, version=2), read_spz, True),
-    "splat": Export("splat", lambda model, path, frame, step, mip: save_splat(model, path, frame), read_splat),
-    "glb": Export("glb", lambda model, path, frame, step, mip: save_glb(model, path, frame)),
-    "usda": Export("usda", lambda model, path, frame, step, mip: save_usda(model, path, frame)),
-    PAGE: Export(PAGE, lambda *_: None),  # of another source than a model alone
+    "splat": Export("splat", save_splat, read_splat),
+    "glb": Export("glb", save_glb),
+    "usda": Export("usda", save_usda),
+    PAGE: Export(PAGE, lambda *_: None),
 }
 """Name, as on the command line -> the format."""
 MOST_ON_PAGE = 800_000
@@ -72,8 +68,8 @@ def export_run(
 
     Args:
         path: folder of the run, or the file of a model.
-        file_format: one of `EXPORTS`, or `PAGE`.
-        out: new file; None: beside the model in the run's folder.
+        file_format: one of `EXPORTS`.
+        out: new file; None: in the run's folder, where ``model.ply`` is the training's own.
         max_gaussians: largest number of Gaussians to keep, those that add most to the training views; None: all.
         given: the capture of a model from a file, and how to render it; None: `path` is a run.
 
@@ -83,50 +79,41 @@ def export_run(
     Raises:
         InputError: an option does not fit, no such model, or no usable capture where it is needed.
     """
-    _require_options(path, file_format, out, max_gaussians, given)
+    form = _required_format(path, file_format, out, max_gaussians, given)
     is_page = file_format == PAGE
     needed = max_gaussians is not None or is_page
     model, scene, absent = load_with_capture(path, given, resolve_device("auto"), needed)
-    file = out
-    if file is None:
-        assert model.folder is not None, "only a run is exported without --out"
-        file = model.folder.model.with_suffix(f".{EXPORTS[file_format].suffix}")
-    if is_page:
-        max_gaussians = min(max_gaussians or MOST_ON_PAGE, MOST_ON_PAGE)
-    kept, whole = model.gaussians, model.gaussians
-    notes: tuple[str, ...] = ()
-    if scene is not None and max_gaussians is not None and max_gaussians < len(whole):
-        kept = pruned(whole, contributions(whole, scene.train.cameras, model.config.raster), max_gaussians)
-        notes = (f"the {len(kept)} of {len(whole)} Gaussians that add most to the training views",)
-    if unmarked := model.antialiased and not EXPORTS[file_format].marked:
-        notes += ("of antialiased training, which this file does not say: viewers draw it thicker",)
+    file = out or path / ("export.ply" if file_format == "ply" else f"model.{form.suffix}")
+    most = min(max_gaussians or MOST_ON_PAGE, MOST_ON_PAGE) if is_page else max_gaussians
+    kept, whole, frame, notes = model.gaussians, model.gaussians, model.frame, []
+    if scene is not None and most is not None and most < len(whole):
+        kept = pruned(whole, contributions(whole, scene.train.cameras, model.config.raster), most)
+        notes.append(f"the {len(kept)} of {len(whole)} Gaussians that add most to the training views")
+    if unmarked := model.antialiased and not form.marked:
+        notes.append("of antialiased training, which this file does not say: viewers draw it thicker")
     if is_page and scene is not None:
         written = page_gaussians(kept, scene.train.cameras, model.sh_degree)
     else:
-        eps2d, usual = model.config.raster.eps2d, DEFAULT_SETTINGS.eps2d
-        if eps2d != usual:
-            notes += (f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}",)
-        form, frame = EXPORTS[file_format], model.frame
-        origin = local_origin(frame) if out is not None or file_format != "ply" else np.zeros(3)
-        if origin.any():
+        if (eps2d := model.config.raster.eps2d) != (usual := DEFAULT_SETTINGS.eps2d):
+            notes.append(f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}")
+        if (origin := local_origin(frame)).any():
             frame = Frame(frame.center - origin, frame.scale)
-            notes += (f"about the local origin {' '.join(f'{value:.12g}' for value in origin)}",)
+            notes.append(f"about the local origin {' '.join(f'{value:.12g}' for value in origin)}")
         if form.suffix == "spz":
-            notes += (f"version {VERSION}; older viewers need --format spz2" if file_format == "spz" else "version 2",)
+            notes.append(
+                f"version {VERSION}; older viewers need --format spz2" if file_format == "spz" else "version 2"
+            )
         form.write(kept, file, frame, model.iteration or 0, model.antialiased)
         written = kept if form.read is None else Similarity.into(frame).apply(form.read(file)).map(torch.Tensor.float)
     lost = f"not measured: {absent or 'the capture has no test views'}"
     caption = f"{len(written):,} Gaussians, one colour each"
     if scene is not None and len(scene.test):
         test, chosen = place_views(scene.test, whole.device, "host"), evenly(len(scene.test), MOST_VIEWS)
-        look, to_device = model.own_look(test), partial(torch.Tensor.to, device=whole.device)
-        plain = replace(look, antialiased=look.antialiased and not unmarked)
-        shown = [
-            (whole, look),
-            (written.map(to_device), replace(plain, sh_degree=min(look.sh_degree, written.sh_degree))),
-        ]
-        errors = [evaluate(each, test, seen, view_ids=chosen) for each, seen in shown]
-        before, after = (each.mean.psnr for each in errors)
+        look = model.own_look(test)
+        degree, antialiased = min(look.sh_degree, written.sh_degree), look.antialiased and not unmarked
+        other = replace(look, sh_degree=degree, antialiased=antialiased)
+        shown = ((whole, look), (written.map(lambda value: value.to(whole.device)), other))
+        before, after = (evaluate(each, test, seen, view_ids=chosen).mean.psnr for each, seen in shown)
         lost = f"{before:.3f} -> {after:.3f} dB on {len(chosen)} of {len(test)} test views"
         caption += f": PSNR {after:.2f} dB on test views, {before:.2f} dB in the trained model"
     if is_page and scene is not None:
@@ -138,10 +125,10 @@ def export_run(
     return f"{file}{said}\nsize   {size}, {len(written)} of {len(whole)} Gaussians\nPSNR   {lost}"
 
 
-def _require_options(
+def _required_format(
     path: Path, file_format: str, out: Path | None, max_gaussians: int | None, given: Config | None
-) -> None:
-    """Raise `InputError` where options do not fit each other, before anything is loaded."""
+) -> Export:
+    """The format. Raises `InputError` where options do not fit each other, before anything is loaded."""
     if file_format not in EXPORTS:
         raise InputError(f"--format {file_format}: there is no such format; choose one of {', '.join(EXPORTS)}")
     if max_gaussians is not None and max_gaussians < 1:
@@ -152,20 +139,12 @@ def _require_options(
             raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in {suffix}")
     elif given is not None:
         raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
-    elif max_gaussians is not None and file_format == "ply":
-        raise InputError("--max-gaussians would replace the run's own model.ply: name a new file by --out")
+    return EXPORTS[file_format]
 
 
 @torch.no_grad()
 def contributions(gaussians: Gaussians, cameras: Cameras, settings: RasterSettings) -> Tensor:
-    """The sum of each Gaussian's blending weights T * alpha over all pixels of some views.
-
-    Args:
-        cameras: of the views; on any device.
-
-    Returns:
-        [N] float64, on the Gaussians' device.
-    """
+    """[N] float64: the sum of each Gaussian's blending weights T * alpha over all pixels of some views."""
     cameras = cameras.to(gaussians.device)
     sums = torch.zeros(len(gaussians), dtype=torch.float64, device=gaussians.device)
     for view in range(len(cameras)):

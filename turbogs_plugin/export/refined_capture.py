@@ -28,7 +28,6 @@ from turbogs_plugin.captures.colmap import find_model, load_pycolmap, read_colma
 from turbogs_plugin.captures.mask_files import FOLDER as MASKS
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
-from turbogs_plugin.scene.scene import Observations
 
 if TYPE_CHECKING:
     import pycolmap
@@ -38,14 +37,8 @@ PHOTOS, MODEL = "images", "sparse"
 
 
 def write_refined(scene: Path, out: Path) -> str:
-    """Write a COLMAP capture with the refined cameras and points of another: ``sparse/0``, and links to its photos.
-
-    Points, colours, features and tracks stay, under their identifiers. Reduced copies of the photos (``images_2``, ...)
-    and masks beside them are linked, too.
-
-    Args:
-        scene: folder of a COLMAP capture.
-        out: new folder; it appears when all of it is written.
+    """Write a COLMAP capture with the refined cameras and points of another: ``sparse/0``, and links to its photos, to
+    reduced copies (``images_2``, ...) and masks. Points, colours, features and tracks stay, under their identifiers.
 
     Returns:
         Lines for the user: what is unusual about the capture, if anything is; how many cameras were refined, with the
@@ -66,7 +59,16 @@ def write_refined(scene: Path, out: Path) -> str:
             f"by  turbogs reconstruct {shlex.quote(str(scene))} --out SCENE"
         )
     capture = read_colmap(scene, *found)
-    observations = _required_observations(found[0], capture)
+    if bent := [lens.camera.model.name for lens in capture.lenses if lens is not None]:
+        raise InputError(
+            f"{found[0]}: {len(bent)} of {len(capture.names)} cameras have distortion ({bent[0]}), and refined cameras "
+            "are pinholes: undistort the capture first by 'colmap image_undistorter', then use what that writes"
+        )
+    if not (observations := capture.observations):
+        raise InputError(
+            f"{found[0]} has no points that its photos show, by which cameras are refined: give a reconstruction as "
+            "COLMAP wrote it, with points and tracks"
+        )
     if capture.photo_folder.resolve() in out.resolve().parents:
         raise InputError(f"--out '{out}' would lie among the photos of '{capture.photo_folder}': choose another folder")
     given = Pinholes.of(capture.viewmats, capture.Ks, capture.sizes)
@@ -92,42 +94,21 @@ def write_refined(scene: Path, out: Path) -> str:
     return "\n".join([*capture.notes[1:], refined.text("cameras"), f"scene  {out}"])
 
 
-def _required_observations(model: Path, capture: Capture) -> Observations:
-    """The places where photos show points. Raises `InputError` where a capture cannot be refined."""
-    names = capture.names
-    if bent := [lens.camera.model.name for lens in capture.lenses if lens is not None]:
-        raise InputError(
-            f"{model}: {len(bent)} of {len(names)} cameras have distortion ({bent[0]}), and refined cameras are "
-            "pinholes: undistort the capture first by 'colmap image_undistorter', then use what that writes"
-        )
-    if capture.observations is None or not len(capture.observations):
-        raise InputError(
-            f"{model} has no points that its photos show, by which cameras are refined: give a reconstruction as "
-            "COLMAP wrote it, with points and tracks"
-        )
-    return capture.observations
-
-
 def _reconstruction(model: Path, suffix: str, capture: Capture, refined: Refinement) -> pycolmap.Reconstruction:
-    """The reconstruction of a capture with other cameras and points.
-
-    Args:
-        model, suffix: what the capture was read from.
-        refined: its cameras, and its points in the order of their identifiers.
-    """
+    """The reconstruction in `model`, from which a capture was read, with refined cameras, and points in the order of
+    their identifiers."""
     pycolmap = load_pycolmap()
     old, new = read_reconstruction(model, suffix), pycolmap.Reconstruction()
     images = {image.name: image for image in old.images.values() if image.has_pose}
+    cameras, kept = refined.cameras, {images[name].image_id for name in capture.names}  # with a photo and a pose
     for view, (name, (width, height)) in enumerate(zip(capture.names, capture.sizes.tolist(), strict=True)):
         number = images[name].image_id  # of the camera, too
-        cameras = refined.cameras
         params = [*cameras.focal[view], *cameras.centers[view]]
         camera = pycolmap.Camera(camera_id=number, model="PINHOLE", width=width, height=height, params=params)
         new.add_camera_with_trivial_rig(camera)
         pose = pycolmap.Rigid3d(np.c_[cameras.rotations[view], cameras.translations[view]])
         image = pycolmap.Image(name, points2D=images[name].points2D, camera_id=number, image_id=number)
         new.add_image_with_trivial_frame(image, pose)
-    kept = {images[name].image_id for name in capture.names}  # not images without a photo or a pose
     for (number, point), place in zip(sorted(old.points3D.items()), refined.points, strict=True):
         point.xyz = place
         point.track.elements = [element for element in point.track.elements if element.image_id in kept]

@@ -7,6 +7,7 @@ import importlib.util
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +19,17 @@ from turbogs_plugin.export.camera_path import from_file, orbit, through_views
 from turbogs_plugin.files import naming, new_file, require_new_file, require_writable, unused_name
 from turbogs_plugin.report.evaluation import open_saved, views_of
 from turbogs_plugin.report.images import depth_picture, save_image, to_uint8
-from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.look import Look
+from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.types import Cameras, Gaussians
 
 RATE = 60
 """Frames a second."""
-PATHS = ("orbit", "views")
+PATHS = {"orbit": orbit, "views": through_views}
 SUFFIXES = (".mp4", ".mkv", ".mov")
-CODEC = "libx264"
-"""Encoder of H.264, which all of these files hold; imageio-ffmpeg would try others first."""
+CODEC, QUALITY = "libx264", 8
+"""Encoder of H.264, which all of these files hold (imageio-ffmpeg would try others first), and its quality, 0 .. 10."""
 INSTALL = 'pip install "imageio-ffmpeg>=0.5"'
-QUALITY = 8
-"""Quality for imageio-ffmpeg, 0 .. 10."""
 
 
 def render_run(
@@ -46,8 +45,6 @@ def render_run(
 
     Args:
         path: folder of the run, or the file of a model.
-        split: test or train.
-        device_name: where to render.
         with_depth: also write each view's expected depth along the camera's axis, in the capture's own units, 0 where
             nothing was hit: as ``.npy`` ([H, W] float32) and as a coloured PNG (`depth_picture`).
         given: the capture of a model from a file, and how to render it; None: `path` is a run.
@@ -65,9 +62,9 @@ def render_run(
         raise InputError(f"'{path}' has no run's folder to render into: name one by --out FOLDER")
     model, scene = open_saved(path, device_name, given)
     views, look = views_of(model, scene, split)
-    target = model.folder.renders if out is None and model.folder is not None else Path(out or ".")
+    target = out or RunFolder(path).renders
     cameras = views.cameras.to(model.gaussians.device)
-    folders = [target / name for name in ([split, f"{split}-depth"] if with_depth else [split])]
+    folders = [target / name for name in (split, f"{split}-depth")[: 1 + with_depth]]
     for folder in folders:
         folder.mkdir(parents=True, exist_ok=True)
     for view_id, name in enumerate(distinct_stems(views.names)):
@@ -93,19 +90,8 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
 def film_run(
     path: Path, camera_path: str, video: Path, seconds: float, device_name: str, given: Config | None = None
 ) -> Path:
-    """Write a film of a run's newest model or of a given one.
-
-    Args:
-        path: folder of the run, or the file of a model.
-        camera_path: orbit, views, or a file of cameras.
-        video: new file.
-        seconds: length of the film.
-        device_name: where to render.
-        given: the capture of a model from a file, and how to render it; None: `path` is a run.
-
-    Raises:
-        InputError: an option does not fit, no such model, or no usable capture.
-    """
+    """Write a film of a run's newest model or of a given one into a new file, along orbit, views, or a file of cameras.
+    Arguments and errors as of `render_run`; `InputError`, too, where an option does not fit."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise InputError(f"a film needs imageio-ffmpeg: {INSTALL}")
     if not 0 < seconds <= 3600:
@@ -117,24 +103,17 @@ def film_run(
     require_new_file(video, "--out")
     require_writable(video.parent, f"--out '{video}'")
     model, scene = open_saved(path, device_name, given)
-    write_film(model.gaussians, model.own_look(scene.train), film_cameras(camera_path, scene, seconds), video)
+    frames = max(1, round(RATE * seconds))
+    along = PATHS.get(camera_path)
+    cameras = along(scene.train.cameras, frames) if along else from_file(Path(camera_path), scene, frames)
+    write_film(model.gaussians, model.own_look(scene.train), cameras, video)
     return video
 
 
-def film_cameras(path: str, scene: Scene, seconds: float) -> Cameras:
-    """The cameras of a film's frames, in the scene's frame."""
-    frames = max(1, round(RATE * seconds))
-    if path not in PATHS:
-        return from_file(Path(path), scene, frames)
-    return (orbit if path == "orbit" else through_views)(scene.train.cameras, frames)
-
-
 def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) -> None:
-    """Render and encode a film. Nothing is left behind where this fails.
+    """Render a model, as it looks, and encode a film. Nothing is left behind where this fails.
 
     Args:
-        gaussians: the model, on the device that renders.
-        look: how it is shown, without exposures.
         cameras: of the frames, all of one size; an odd side loses a pixel, which the encoder needs.
         video: a new file, whose suffix says which container.
 
@@ -147,20 +126,16 @@ def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) 
 
     width, height = (cameras.sizes[0] // 2 * 2).tolist()
     cameras = cameras.to(gaussians.device)
-    hidden = tempfile.TemporaryDirectory(dir=video.parent, prefix=".")
-    temporary = Path(hidden.name) / video.name  # ffmpeg knows the container by the suffix
     options = {"fps": RATE, "codec": CODEC, "quality": QUALITY, "macro_block_size": 1, "ffmpeg_log_level": "error"}
-    writer = imageio_ffmpeg.write_frames(str(temporary), (width, height), **options)
-    try:
-        writer.send(None)
-        told = Console(stderr=True)
-        for frame in track(range(len(cameras)), "frames", console=told, disable=not sys.stderr.isatty()):
-            image = render_image(gaussians, cameras, frame, **look.options)
-            writer.send(np.ascontiguousarray(to_uint8(image.colors)[:height, :width]))
-        writer.close()
-        temporary.replace(video)
-    except OSError as error:  # of the pipe to the encoder
-        raise InputError(f"--out '{video}' cannot be encoded: {' '.join(str(error).split())[:200]}") from None
-    finally:
-        writer.close()
-        hidden.cleanup()
+    told = {"console": Console(stderr=True), "disable": not sys.stderr.isatty()}
+    with tempfile.TemporaryDirectory(dir=video.parent, prefix=".") as hidden:
+        temporary = Path(hidden) / video.name  # ffmpeg knows the container by the suffix
+        try:
+            with closing(imageio_ffmpeg.write_frames(str(temporary), (width, height), **options)) as writer:
+                writer.send(None)
+                for frame in track(range(len(cameras)), "frames", **told):
+                    image = render_image(gaussians, cameras, frame, **look.options)
+                    writer.send(np.ascontiguousarray(to_uint8(image.colors)[:height, :width]))
+            temporary.replace(video)
+        except OSError as error:  # of the pipe to the encoder
+            raise InputError(f"--out '{video}' cannot be encoded: {' '.join(str(error).split())[:200]}") from None

@@ -27,9 +27,9 @@ from turbogs_plugin.gsplat_bridge.host import (
     role_of,
 )
 from turbogs_plugin.gsplat_bridge.host_views import posed_images
-from turbogs_plugin.model.gsplat_file import BANDS
 from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.model.limits import RESTRAIN_EVERY
+from turbogs_plugin.model.torch_file import BANDS
 from turbogs_plugin.plan import SceneFacts, make_plan
 from turbogs_plugin.plan.decisions import wanted_iterations
 from turbogs_plugin.scene import Frame, PosedImages, Scene

@@ -15,43 +15,27 @@ from turbogs_plugin.types import SH_C0, Gaussians
 DARKEST = 0.5
 """Smallest channel of a new Gaussian's colour, out of 255: at exactly 0 the clamp of colours may zero its gradient."""
 SMALLEST_SCALE = 1e-4
-"""Smallest scale of a new Gaussian, in extents: coincident points would otherwise give a scale of zero."""
-BACKDROP_COUNT = 3000
-"""Number of Gaussians in the backdrop, 3.7 degrees apart: enough for one colour, and few compared with a capture."""
-BACKDROP_RADIUS = 20.0
-"""Distance of the backdrop, in extents: behind everything in a capture, near enough for the precision of float32."""
-BACKDROP_OPACITY = 0.88
-"""Opacity of the backdrop's Gaussians. Several of them cover each direction, so nothing shines through."""
+"""Smallest scale of a new Gaussian, in extents: coincident points give none."""
+BACKDROP_COUNT, BACKDROP_RADIUS, BACKDROP_OPACITY = 3000, 20.0, 0.88
+"""Gaussians of the backdrop: 3.7 degrees apart; their distance in extents, behind everything in a capture and near
+enough for float32; their opacity, where several cover each direction, so that nothing shines through."""
 
 
 def gaussians_from_points(
     points: Tensor, colors: Tensor, sh_degree: int, extent: float, opacity: float = 0.1, size: float = 1.0
 ) -> Gaussians:
-    """One isotropic Gaussian for each point, as 3DGS starts (Kerbl et al. 2023, section 5.1).
+    """One isotropic Gaussian for each point [M, 3], M >= 2, as 3DGS starts (Kerbl et al. 2023, section 5.1).
 
-    Its scale is `size` times the mean distance to the three nearest points. Its colour is the point's; channels of 0
-    become `DARKEST`. The higher bands are zero.
-
-    Args:
-        points: [M, 3] float, finite.
-        colors: [M, 3] uint8.
-        sh_degree: highest degree to allocate, 0 .. 3.
-        extent: the scene's, in the points' unit; gives the smallest scale where points coincide.
-        opacity: opacity of every Gaussian, within (0, 1).
-        size: factor of the scales.
-
-    Raises:
-        InputError: fewer than two points.
-    """
+    Its scale is `size` times the mean distance to the three nearest points, at least `SMALLEST_SCALE` extents. Its
+    colour is the point's ([M, 3] uint8); channels of 0 become `DARKEST`. Harmonics are zero up to `sh_degree`.
+    Raises `InputError` for fewer than two points."""
     count = len(points)
     if count < 2:
         raise InputError(f"there are too few points to start from: {count}")
     scales = (size * mean_neighbor_distances(points, neighbors=3)).clamp(min=SMALLEST_SCALE * extent).log()
-    quats = points.new_zeros(count, 4)
-    quats[:, 0] = 1.0
     return Gaussians(
         means=points.clone(),
-        quats=quats,
+        quats=points.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
         scales=scales[:, None].repeat(1, 3),
         opacities=points.new_full((count,), math.log(opacity / (1.0 - opacity))),
         sh0=((colors.to(points).clamp(min=DARKEST) / 255.0 - 0.5) / SH_C0)[:, None, :],
@@ -60,15 +44,8 @@ def gaussians_from_points(
 
 
 def backdrop_gaussians(color: Tensor, sh_degree: int, extent: float) -> Gaussians:
-    """A sphere of one colour around the scene and all cameras, seen where the model has nothing else.
-
-    Without it, such pixels are black. Its Gaussians lie on a Fibonacci lattice and train like all others.
-
-    Args:
-        color: [3] float, 0 .. 1, for instance the mean of the photos.
-        sh_degree: highest degree to allocate, 0 .. 3.
-        extent: the scene's.
-    """
+    """A sphere of one colour ([3] float, 0 .. 1) around the scene and all cameras, seen where the model has nothing
+    else, which would be black. Its Gaussians lie on a Fibonacci lattice and train like all others."""
     index = torch.arange(BACKDROP_COUNT, dtype=torch.float64) + 0.5
     height = 1.0 - 2.0 * index / BACKDROP_COUNT
     angle = index * math.pi * (1.0 + math.sqrt(5.0))

@@ -29,15 +29,10 @@ RESTRAIN_EVERY = 10
 
 @dataclass(frozen=True)
 class Clearance:
-    """A sphere around each training camera that is kept free of Gaussians.
+    """A sphere around each training camera, at `centers` [V, 3] and of `radii` [V], that is kept free of Gaussians.
 
     Faint Gaussians before a camera cost it little, but veil a test view from there: a haze that no training view
-    corrects.
-
-    Args:
-        centers: [V, 3] the cameras' places.
-        radii: [V] of the spheres.
-    """
+    corrects."""
 
     centers: Tensor
     radii: Tensor
@@ -45,11 +40,8 @@ class Clearance:
     @classmethod
     @torch.no_grad()
     def of(cls, points: Tensor, centers: Tensor) -> Clearance | None:
-        """The spheres of a capture; None where it has fewer than `POINTS` points.
-
-        Args:
-            points: [M, 3] of the reconstruction, on the device of `centers` [V, 3].
-        """
+        """The spheres of a capture with points [M, 3], on the device of `centers` [V, 3]; None where it has fewer than
+        `POINTS` points."""
         if len(points) < POINTS:
             return None
         points = points[:: -(-len(points) // POINTS_LOOKED_AT)]
@@ -63,11 +55,7 @@ class Clearance:
 
     @torch.no_grad()
     def clear(self, update: RowUpdate, gaussians: Gaussians) -> RowUpdate:
-        """`update` without the rows that would lie in a sphere. To be called before the change is applied.
-
-        Args:
-            update: a change of `gaussians`.
-        """
+        """`update` of `gaussians` without the rows that would lie in a sphere. To be called before it is applied."""
         means, reach = update.new("means", gaussians), self.radii.amax()
         low, high = self.centers.amin(dim=0) - reach, self.centers.amax(dim=0) + reach
         among = ((means > low) & (means < high)).all(dim=1).nonzero()[:, 0]  # the cameras: others are in no sphere
@@ -87,19 +75,13 @@ def _distances(points: Tensor, centers: Tensor) -> Iterator[Tensor]:
 
 @torch.no_grad()
 def restrain_distant(gaussians: Gaussians, extent: float, size: float) -> None:
-    """Limit the size of Gaussians beyond `DISTANT` extents, in place, to a share of their distance from all cameras.
+    """Limit the size of Gaussians beyond `DISTANT` extents, in place: the ratio of a standard deviation to the distance
+    from the nearest place of a camera is at most `size`. The cameras' centre is the origin, and all lie within an
+    extent.
 
-    A splat's size is its Gaussian's size over its depth, and its distance from the image's middle is its centre's
-    distance from the axis over the same depth. So a Gaussian beside a camera reaches the middle of the image, whatever
-    its depth and perhaps in front of everything, once its deviation is a third of its distance (splats are cut at
-    3.33). It may happen that no training view shows it.
-
-    Args:
-        gaussians: the model, with the cameras' centre as origin.
-        extent: the scene's; all cameras lie within it.
-        size: largest allowed ratio of a standard deviation to the distance from the nearest place of a camera.
-    """
+    A Gaussian beside a camera reaches the middle of the image, whatever its depth and perhaps in front of everything,
+    once its deviation is a third of its distance (splats are cut at 3.33): size and place of a splat are both divided
+    by the depth. It may happen that no training view shows it."""
     distances = gaussians.means.norm(dim=-1, keepdim=True)  # [N, 1]
-    limits = (size * (distances - extent)).log()
-    limits = torch.where(distances > DISTANT * extent, limits, torch.inf)
+    limits = torch.where(distances > DISTANT * extent, (size * (distances - extent)).log(), torch.inf)
     torch.minimum(gaussians.scales, limits, out=gaussians.scales)

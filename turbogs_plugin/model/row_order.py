@@ -17,34 +17,21 @@ SPREADS = tuple(
 
 
 def in_order_of_space(update: RowUpdate, gaussians: Gaussians, step: Step) -> RowUpdate:
-    """`update` with its new rows sorted in space. To be called before the change is applied.
+    """`update` with its new rows sorted in space. `gaussians` are as before it, with the cameras' centre as origin.
 
     Kernels read the splats of a tile, and add to them, by row; so splats seen together should be near in memory. After
-    `Step.refine_until` the change stays as it is: Gaussians are then only removed, which leaves the others in order.
-
-    Args:
-        update: a change of `gaussians`.
-        gaussians: the model before the change, with the cameras' centre as origin.
-        step: the time of the change.
-    """
+    `Step.refine_until` the change stays as it is: Gaussians are then only removed, which leaves the others in order."""
     if step.iteration > step.refine_until:
         return update
     return update.taking(spatial_order(update.new("means", gaussians), step.scene_extent))
 
 
 def spatial_order(means: Tensor, extent: float) -> Tensor:
-    """Rows in Morton order (Morton 1966, "A computer oriented geodetic data base").
+    """[N] int64: rows of `means` [N, 3] in Morton order (Morton 1966, "A computer oriented geodetic data base").
 
-    Coordinates are first mapped by x / (extent + |x|), so that every point has a place, however far away. Ties keep
-    their order, and points that are not finite are among the last. Does not wait for the GPU.
-
-    Args:
-        means: [N, 3] float.
-        extent: the scene's, in the unit of `means`; at this distance cells are four times as large as at the origin.
-
-    Returns:
-        [N] int64, a permutation.
-    """
+    Coordinates are first mapped by x / (extent + |x|), so that every point has a place, however far away: at one extent
+    cells are four times as large as at the origin. Ties keep their order, and points that are not finite are among the
+    last. Does not wait for the GPU."""
     contracted = means / (extent + means.abs())  # [N, 3], within (-1, 1)
     cells = ((contracted.double() + 1.0) * 2.0 ** (BITS - 1)).nan_to_num(2.0**BITS, 2.0**BITS)
     spread = cells.long().clamp(0, 2**BITS - 1)

@@ -17,8 +17,6 @@ from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.geometry import quaternions
 from turbogs_plugin.types import Gaussians
 
-SAMPLED_DIRECTIONS = 64
-"""Directions by which the rotation of harmonics is found; the largest degree has 7 functions."""
 LARGEST_ROUNDING = 1e-4
 """Largest `rounding` that a file of single precision may have."""
 OPAQUE, FLAT = 20.0, -20.0
@@ -27,13 +25,7 @@ OPAQUE, FLAT = 20.0, -20.0
 
 @dataclass(frozen=True)
 class Similarity:
-    """``new = scale * rotation @ old + translation``, in float64.
-
-    Args:
-        rotation: [3, 3], with determinant 1.
-        scale: positive.
-        translation: [3].
-    """
+    """``new = scale * rotation @ old + translation``, in float64: [3, 3], a positive number, and [3]."""
 
     rotation: np.ndarray
     scale: float
@@ -64,55 +56,37 @@ class Similarity:
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """The model in the new coordinates, in its own dtype. Without a rotation, quaternions and harmonics keep
         their bits."""
-        rotation = torch.from_numpy(self.rotation).to(gaussians.means)
-        translation = torch.from_numpy(self.translation).to(gaussians.means)
         if not np.array_equal(self.rotation, np.eye(3)):
-            turn = torch.from_numpy(quaternions(self.rotation[None])[0]).to(gaussians.means)
+            w, x, y, z = quaternions(self.rotation[None])[0]
+            product = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]).to(gaussians.means)
             gaussians = replace(
                 gaussians,
-                means=gaussians.means @ rotation.T,
-                quats=_product(turn, gaussians.quats),
+                means=gaussians.means @ torch.from_numpy(self.rotation).to(gaussians.means).T,
+                quats=gaussians.quats @ product.T,
                 shN=_turned_harmonics(gaussians.shN, self.rotation),
             )
-        means, scales = self.scale * gaussians.means + translation, gaussians.scales + math.log(self.scale)
-        return replace(gaussians, means=means, scales=scales)
+        means = self.scale * gaussians.means + torch.from_numpy(self.translation).to(gaussians.means)
+        return replace(gaussians, means=means, scales=gaussians.scales + math.log(self.scale))
 
 
-def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaussians:
-    """A file's model in other coordinates, as training and rendering take it.
+def placed(gaussians: Gaussians, change: Similarity, source: Path) -> Gaussians:
+    """A file's model (float64), changed, as training and rendering take it: float32, on the CPU.
 
-    Args:
-        gaussians: float64, as the file has them. Infinite opacities and scales of 0 become finite. Those that are not
-            finite are left out, with a warning that counts them, and with one that counts flat ones.
-        change: from the file's coordinates.
-        source: the file, for messages.
-
-    Returns:
-        float32, on the CPU.
-
-    Raises:
-        InputError: no Gaussian is finite.
-    """
+    Infinite opacities and scales of 0 become finite; Gaussians that are not finite are left out. Warnings about the
+    file `source` count flat ones and these. Raises `InputError` where none is left."""
     if count := int((flat := gaussians.scales == -math.inf).any(dim=1).sum()):
         warnings.warn(f"{source}: {count} Gaussians are flat (scale 0, as of 2DGS) and drawn thin", stacklevel=3)
     opacities = gaussians.opacities.where(~gaussians.opacities.isinf(), OPAQUE * gaussians.opacities.sign())
     gaussians = replace(gaussians, opacities=opacities, scales=gaussians.scales.masked_fill(flat, FLAT))
-    rows = change.apply(gaussians).map(lambda value: value.float().contiguous())
-    return _finite(rows, source)
+    return _finite(change.apply(gaussians).map(lambda value: value.float().contiguous()), source)
 
 
 def in_capture(gaussians: Gaussians, frame: Frame, target: Path, double_means: bool = False) -> Gaussians:
     """A model as files have it: in the capture's own coordinates, float32 on the CPU; means in float64 if
     `double_means`, which a frame far from the capture's origin needs (`local_origin`).
 
-    Args:
-        gaussians: those that are not finite are left out, with a warning that counts them.
-        frame: of the model's coordinates.
-        target: the file, for messages.
-
-    Raises:
-        InputError: none is left.
-    """
+    Gaussians that are not finite are left out; a warning about the file `target` counts them. Raises `InputError` where
+    none is left."""
     rows = gaussians.map(lambda value: value.detach().cpu().contiguous())
     means = torch.from_numpy(frame.restore_points(rows.means.numpy()))
     means = means if double_means else means.float()
@@ -140,7 +114,7 @@ def rounding(frame: Frame) -> float:
     return float(np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 / frame.scale)
 
 
-def _finite(gaussians: Gaussians, file: str | Path) -> Gaussians:
+def _finite(gaussians: Gaussians, file: Path) -> Gaussians:
     """The Gaussians of which every number is finite, with a warning that counts the others. Raises `InputError` where
     there is none."""
     finite = gaussians.finite_rows()
@@ -153,30 +127,19 @@ def _finite(gaussians: Gaussians, file: str | Path) -> Gaussians:
     return gaussians.map(lambda value: value[finite])
 
 
-def _product(left: Tensor, right: Tensor) -> Tensor:
-    """[N, 4] Hamilton products of one quaternion [4] with others [N, 4], wxyz."""
-    (w, v), (real, imaginary) = (left[0], left[1:]), (right[:, :1], right[:, 1:])
-    turned = w * imaginary + real * v + torch.linalg.cross(v.expand_as(imaginary), imaginary)
-    return torch.cat([w * real - imaginary @ v[:, None], turned], dim=1)
-
-
 def _turned_harmonics(shN: Tensor, rotation: np.ndarray) -> Tensor:
     """[N, B, 3] coefficients whose colour in direction ``rotation @ d`` is that of `shN` in direction d.
 
-    The functions of one degree turn among themselves, so the matrix of a degree follows from their values in a few
-    directions.
+    The functions of one degree turn among themselves, so the matrix of a degree follows from their values in more
+    directions than the 7 functions of the largest one.
     """
-    if shN.shape[1] == 0:
-        return shN
-    degree = round((shN.shape[1] + 1) ** 0.5) - 1
-    generator = torch.Generator().manual_seed(0)
-    directions = torch.randn(SAMPLED_DIRECTIONS, 3, generator=generator, dtype=torch.float64)
+    turned, degree = shN.clone(), round((shN.shape[1] + 1) ** 0.5) - 1
+    directions = torch.randn(64, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     directions = torch.nn.functional.normalize(directions, dim=1)
     before = basis(directions, degree)  # [R, B]
     after = basis(directions @ torch.from_numpy(rotation).double().T, degree)  # [R, B]
-    parts = []
     for of in range(1, degree + 1):
         rows = slice(num_bands(of - 1), num_bands(of))
         matrix = torch.linalg.lstsq(after[:, rows], before[:, rows]).solution  # [2 d + 1, 2 d + 1]
-        parts.append(torch.einsum("ij,njc->nic", matrix.to(shN), shN[:, rows]))
-    return torch.cat(parts, dim=1)
+        turned[:, rows] = torch.einsum("ij,njc->nic", matrix.to(shN), shN[:, rows])
+    return turned

@@ -27,22 +27,18 @@ from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import too_large
 from turbogs_plugin.types import Gaussians
 
-MAGIC = 0x5053474E
-VERSION = 3
+MAGIC, VERSION = 0x5053474E, 3
 HEADER, STREAM = struct.Struct("<IIIBBBB"), struct.Struct("<QQ")
 """Magic, version, number of Gaussians, degree, fractional bits of positions, flags, zero (in version 4 the number of
 streams, after which 4 bytes say where their table begins); a stream's bytes in the file, and unpacked."""
 ANTIALIASED, EXTENDED = 1, 2
 """Flags: drawn with antialiasing; records of other makers follow (in version 4, before the table)."""
 MOST_FRACTIONAL_BITS = 20
-COLOR_SCALE = 0.15
-SH_SCALE = 128.0
-"""A coefficient of the harmonics in steps of 1 / 128. Niantic's own writer drops three and four of the eight bits of
-degree 1 and of those above, which a reader does not notice: the small coefficients of a capture whose cameras look one
-way all became 0."""
-LARGEST_COMPONENT = 511
-"""Largest code of each of a quaternion's three stored components: 9 bits and a sign, for 0 .. 1 / sqrt(2)."""
-GZIP_LEVEL = 6
+COLOR_SCALE, SH_SCALE = 0.15, 128.0
+"""Bytes are colours times 255 * 0.15, and harmonics times 128. Niantic's writer drops three or four of the latter's
+bits, by which the small coefficients of a capture whose cameras look one way all became 0."""
+SIZE, SIGN, UNIT = 511, 512, 511 * math.sqrt(2.0)
+"""Bits of a quaternion's stored component, its sign's, and its code where it were 1; it is at most 1 / sqrt(2)."""
 MOST_UNPACKED, ALWAYS_UNPACKED = 16, 2**20
 """Most bytes that a byte of the file may unpack to, and bytes that any file may: positions alone, nine of a Gaussian's
 20 to 65 bytes, hardly pack."""
@@ -53,15 +49,8 @@ READING = 2 * 8 * 59
 def save_spz(
     gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, antialiased: bool = False, version: int = VERSION
 ) -> None:
-    """Write a model, whole or not at all, in the capture's own coordinates. Arguments and errors as of `in_capture`;
-    `step` has no place in this format. `InputError`, too, where positions are too large for it.
-
-    Args:
-        antialiased: how the model is drawn, which a flag says.
-        version: 2 or 3.
-    """
-    gaussians = upright(in_capture(gaussians, frame, path))
-    values = {name: value.double().numpy() for name, value in gaussians.items()}
+    """Write a model (`formats.Format`) in version 2 or 3. `InputError` where positions are too large for it."""
+    values = {name: value.double().numpy() for name, value in upright(in_capture(gaussians, frame, path)).items()}
     largest = float(np.abs(values["means"]).max())
     bits = min(MOST_FRACTIONAL_BITS, 22 - max(0, math.ceil(math.log2(max(largest, 1e-9)))))
     if bits < 0:
@@ -69,18 +58,16 @@ def save_spz(
     fixed = np.rint(values["means"] * 2.0**bits).astype("<i4")  # [N, 3]
     quats = values["quats"][:, [1, 2, 3, 0]]
     quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
-    positive = np.where(quats[:, 3:] < 0, -quats, quats)[:, :3]
-    rotations = _packed_rotations(quats).tobytes() if version > 2 else _bytes(127.5 * positive + 127.5)
     parts = [
-        HEADER.pack(MAGIC, version, len(gaussians), gaussians.sh_degree, bits, ANTIALIASED * antialiased, 0),
+        HEADER.pack(MAGIC, version, len(fixed), gaussians.sh_degree, bits, ANTIALIASED * antialiased, 0),
         fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3].tobytes(),
         _bytes(255.0 / (1.0 + np.exp(-values["opacities"]))),
         _bytes(values["sh0"][:, 0] * (COLOR_SCALE * 255.0) + 127.5),
         _bytes((values["scales"] + 10.0) * 16.0),
-        rotations,
+        _packed_rotations(quats).tobytes() if version > 2 else _bytes(127.5 * _positive(quats, 3)[:, :3] + 127.5),
         _bytes(values["shN"] * SH_SCALE + 128.0),
     ]
-    content = gzip.compress(b"".join(parts), GZIP_LEVEL, mtime=0)
+    content = gzip.compress(b"".join(parts), 6, mtime=0)
     write_atomically(path, lambda file: file.write(content))
 
 
@@ -91,26 +78,21 @@ def is_antialiased_spz(path: Path) -> bool:
 
 
 def read_spz(path: Path) -> Gaussians:
-    """A model in x right, y down, z forward; float64, on the CPU.
-
-    Raises:
-        InputError: the file is not a whole one of this format, of version 4 where zstandard is not installed, or
-            unpacks to more than `MOST_UNPACKED` times its bytes, or than the memory takes.
-    """
+    """A model in x right, y down, z forward; float64, on the CPU. Raises `InputError` where the file is not a whole one
+    of this format, needs zstandard (version 4), or unpacks to more than `MOST_UNPACKED` times its bytes, or than the
+    memory takes."""
     version, bits, (means, opacities, colors, scales, rotations, harmonics) = _unpacked(path)
-    count = len(opacities)
     if version == 1:
         warnings.warn(f"{path} is of version 1, which has positions in half precision: export it again", stacklevel=2)
         places = means.view("<f2").astype(np.float64)
     else:
-        wide = np.zeros((count, 3, 4), dtype=np.uint8)
-        wide[:, :, 1:] = means.reshape(count, 3, 3)  # in the upper bytes, so that the sign is theirs
+        wide = np.zeros((len(means), 3, 4), dtype=np.uint8)
+        wide[:, :, 1:] = means.reshape(-1, 3, 3)  # in the upper bytes, so that the sign is theirs
         places = (wide.view("<i4")[:, :, 0] >> 8) / 2.0**bits
     if version > 2:
-        quats = _unpacked_rotations(rotations.view("<u4")[:, 0])
+        quats = _unpacked_rotations(rotations.view("<u4"))
     else:
-        quats = np.c_[rotations / 127.5 - 1.0, np.zeros(count)]
-        quats[:, 3] = np.sqrt(np.maximum(0.0, 1.0 - np.square(quats).sum(axis=1)))
+        quats = _with_rest(rotations / 127.5 - 1.0, np.full((len(means), 1), 3))
     shares = (opacities[:, 0] / 255.0).clip(1e-4, 1.0 - 1e-4)
     values = {
         "means": places,
@@ -118,9 +100,9 @@ def read_spz(path: Path) -> Gaussians:
         "scales": scales / 16.0 - 10.0,
         "opacities": np.log(shares / (1.0 - shares)),
         "sh0": ((colors / 255.0 - 0.5) / COLOR_SCALE)[:, None],
-        "shN": (harmonics.reshape(count, -1, 3) - 128.0) / SH_SCALE,
+        "shN": (harmonics.reshape(len(means), -1, 3) - 128.0) / SH_SCALE,
     }
-    return upright(Gaussians(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in values.items()}))
+    return upright(Gaussians(**{name: torch.from_numpy(value) for name, value in values.items()}))
 
 
 def _header(content: bytes) -> tuple[Any, tuple[int, ...]]:
@@ -141,15 +123,14 @@ def _unpacked(path: Path) -> tuple[int, int, list[np.ndarray]]:
             raise InputError(f"{path} is no .spz of version 1 .. 4 and degree 0 .. 3: convert what it was made of")
         widths = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1))
         size = count * sum(widths)
+        announced = f"{path} of version {version} announces {count} Gaussians"
         if size > max(ALWAYS_UNPACKED, MOST_UNPACKED * len(content)):
-            raise InputError(
-                f"{path} announces {count} Gaussians in {len(content)} bytes: it is damaged, export it again"
-            )
+            raise InputError(f"{announced} in {len(content)} bytes: it is damaged, export it again")
         if too_large(READING * count):
-            raise InputError(f"{path} announces {count} Gaussians, more than fit in the free memory: export it again")
+            raise InputError(f"{announced}, more than fit in the free memory: export it again")
         if unpacker:
             body = unpacker.decompress(unpacker.unconsumed_tail, size + 1)
-            whole = (len(body) == size and unpacker.eof) or (len(body) > size and flags & EXTENDED)
+            whole = unpacker.eof if len(body) == size else len(body) > size and flags & EXTENDED
         else:
             body = _of_streams(content, streams, [count * width for width in widths if width])
             whole = len(body) == size
@@ -158,9 +139,7 @@ def _unpacked(path: Path) -> tuple[int, int, list[np.ndarray]]:
     except (OSError, zlib.error, struct.error) as error:
         raise InputError(f"cannot read {path} as .spz of version {version}: {error}; export it again") from None
     if not whole:
-        raise InputError(
-            f"{path} of version {version} lacks some of the {count} Gaussians it announces: export it again"
-        )
+        raise InputError(f"{announced} and lacks some of them: export it again")
     arrays = np.split(np.frombuffer(body, dtype=np.uint8, count=size), count * np.cumsum(widths[:-1]))
     return version, bits, [array.reshape(count, width) for array, width in zip(arrays, widths, strict=True)]
 
@@ -184,27 +163,29 @@ def _of_streams(content: bytes, streams: int, sizes: list[int]) -> bytes:
 def _packed_rotations(unit: np.ndarray) -> np.ndarray:
     """[N] uint32 of [N, 4] unit quaternions, xyzw: the place of the largest component in 2 bits, then the others in
     their order, a sign and 9 bits each."""
-    largest = np.abs(unit).argmax(axis=1)
-    unit = np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -unit, unit)
-    sizes = np.floor(LARGEST_COMPONENT * np.abs(unit) * math.sqrt(2.0) + 0.5).clip(0, LARGEST_COMPONENT)
-    codes = np.where(unit < 0, sizes + LARGEST_COMPONENT + 1, sizes).astype(np.uint32)  # sign and size
-    words = largest.astype(np.uint32)
-    for place in range(4):
-        words = np.where(largest == place, words, words << np.uint32(10) | codes[:, place])
-    return words.astype("<u4")
+    largest = np.abs(unit).argmax(axis=1, keepdims=True)  # [N, 1]
+    others = _positive(unit, largest)[np.arange(4) != largest].reshape(-1, 3)
+    codes = np.rint(UNIT * np.abs(others)).clip(0, SIZE).astype("<u4") | np.where(others < 0, SIGN, 0).astype("<u4")
+    return largest[:, 0].astype("<u4") << 30 | codes[:, 0] << 20 | codes[:, 1] << 10 | codes[:, 2]
 
 
 def _unpacked_rotations(words: np.ndarray) -> np.ndarray:
-    """[N, 4] unit quaternions, xyzw, of what `_packed_rotations` gives."""
-    largest = words >> 30
-    found = np.zeros((len(words), 4))
-    for place in (3, 2, 1, 0):
-        stored, size = largest != place, (words & LARGEST_COMPONENT) / (LARGEST_COMPONENT * math.sqrt(2.0))
-        found[:, place] = np.where(stored, np.where(words & (LARGEST_COMPONENT + 1), -size, size), 0.0)
-        words = np.where(stored, words >> 10, words)
-    rest = np.sqrt(np.maximum(0.0, 1.0 - np.square(found).sum(axis=1)))
-    np.put_along_axis(found, largest[:, None].astype(np.int64), rest[:, None], axis=1)
+    """[N, 4] unit quaternions, xyzw, of what `_packed_rotations` gives, [N, 1]."""
+    codes = words >> np.array([20, 10, 0], dtype=np.uint32)  # [N, 3]
+    return _with_rest(np.where(codes & SIGN, -1.0, 1.0) * (codes & SIZE) / UNIT, words >> 30)
+
+
+def _with_rest(others: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """[N, 4] unit quaternions of three of their components [N, 3], and the place [N, 1] of the positive fourth."""
+    found, is_rest = np.empty((len(others), 4)), np.arange(4) == place
+    found[~is_rest] = others.ravel()
+    found[is_rest] = np.sqrt(np.maximum(0.0, 1.0 - np.square(others).sum(axis=1)))
     return found
+
+
+def _positive(quats: np.ndarray, place: np.ndarray | int) -> np.ndarray:
+    """[N, 4] quaternions of the same rotations whose component at `place` is not negative."""
+    return np.where(np.take_along_axis(quats, np.broadcast_to(place, (len(quats), 1)), axis=1) < 0, -quats, quats)
 
 
 def _bytes(values: np.ndarray) -> bytes:

@@ -1,4 +1,5 @@
-"""Files of `torch.save` from anybody: plain tensors and values only, no larger in memory than on the disk."""
+"""Files of `torch.save` from anybody: plain tensors and values only, no larger in memory than on the disk; and models
+as gsplat's example trainer saves them: ``{"step": int, "splats": {parameter: tensor}}``."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ import os
 import pickletools
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,19 @@ from torch import Tensor
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
+from turbogs_plugin.model.similarity import in_capture
+from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.host_arrays import too_large
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
 
 PLAIN = re.compile(
     r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|"
     r"torch (\w+Storage|Size|device|float\d+|bfloat16|u?int\d+|bool)"
 )
 """Names that a file may call. torch allows others besides, some of which take any amount of memory."""
+
+BANDS = (0, 3, 8, 15)
+"""Numbers of bands of harmonics above degree 0, of the degrees 0 .. 3."""
 
 
 def read_plain(path: Path, name: str, remedy: str = "") -> Any:
@@ -30,16 +37,9 @@ def read_plain(path: Path, name: str, remedy: str = "") -> Any:
     Only plain tensors and values are read (``weights_only``), by the names of `PLAIN`. They must be uncompressed, no
     larger than the file, and in the host's memory, and no tuple may stand in several places. So a file from an
     untrusted source can neither run code nor take more memory than some 100 bytes for each of its own, nor work without
-    end. One that is large beside the free memory stays on the disk, from where tensors are read as they are used; its
-    checksums are not looked at.
+    end. Tensors of one that is large beside the free memory are read from the disk as they are used.
 
-    Args:
-        name: of the file, for messages.
-        remedy: what to do about a file that cannot be used.
-
-    Raises:
-        InputError: the file cannot be read, or used.
-    """
+    Raises `InputError` about the file, called `name`, where it cannot be read or used, with the `remedy`."""
     try:
         _require_bounded(path)
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=too_large(os.path.getsize(path)))
@@ -50,7 +50,7 @@ def read_plain(path: Path, name: str, remedy: str = "") -> Any:
     except OSError as error:
         raise InputError(f"cannot read {name}: {error.strerror or error}") from None
     except Exception as error:  # torch and zipfile raise a dozen kinds for malformed files
-        reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
+        reason = (str(error) or type(error).__name__).splitlines()[0][:160]
         if "weights only" in str(error).lower().replace("_", " "):
             reason = "it holds more than plain tensors and values"
         raise InputError(f"{name} cannot be used: {reason}{remedy}") from None
@@ -104,16 +104,16 @@ def _tensors(state: Any) -> Iterator[Tensor]:
 def _require_bounded(path: Path) -> None:
     """Refuse archives that unpack to more than their size, or whose values do (`_require_plain`)."""
     with zipfile.ZipFile(path) as archive:
-        entries = archive.infolist()
-        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
-            raise ValueError("its entries are compressed")
-        if sum(entry.file_size for entry in entries) > os.path.getsize(path):
-            raise ValueError("its entries overlap")
-        names = [entry.filename.lower() for entry in entries]  # torch does not tell capitals from small letters
-        if len({*names}) < len(names):
+        # torch does not tell capitals from small letters.
+        entries = {entry.filename.lower(): entry for entry in archive.infolist()}
+        if len(entries) < len(archive.infolist()):
             raise ValueError("it has two entries of one name")
-        for entry in entries:
-            if entry.filename.lower().endswith(".pkl"):
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries.values()):
+            raise ValueError("its entries are compressed")
+        if sum(entry.file_size for entry in entries.values()) > os.path.getsize(path):
+            raise ValueError("its entries overlap")
+        for name, entry in entries.items():
+            if name.endswith(".pkl"):
                 _require_plain(archive.read(entry))
 
 
@@ -131,3 +131,35 @@ def _require_plain(pickled: bytes) -> None:
             raise ValueError("it has one tuple in several places")
         else:
             made = code.name
+
+
+def save_gsplat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, antialiased: bool = False) -> None:
+    """Write a model (`formats.Format`) as gsplat's trainer does."""
+    save_plain(path, {"step": step, "splats": dict(in_capture(gaussians, frame, path).items())})
+
+
+def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:
+    """The model in a state that gsplat's trainer saved, in the file's own coordinates; float64, on the CPU, perhaps
+    with rows that are not finite. Raises `InputError`, about the file `path`, where parameters are missing or of other
+    shapes."""
+    splats = state["splats"] if isinstance(state["splats"], Mapping) else {}
+    if missing := [name for name in PARAMETER_NAMES if not isinstance(splats.get(name), Tensor)]:
+        present = ", ".join(sorted(map(str, splats))[:8]) or "nothing"
+        raise InputError(
+            f"{path}: its splats lack {', '.join(missing)} (there is {present}): give a 3DGS model, trained without "
+            "gsplat's appearance network (app_opt)"
+        )
+    count = len(splats["means"]) if splats["means"].dim() else 0
+    bands = splats["shN"].shape[1] if splats["shN"].dim() == 3 else -1
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 1, 3), (count, bands, 3))
+    for name, shape in zip(PARAMETER_NAMES, shapes, strict=True):
+        value = splats[name]
+        if value.shape != shape or not value.is_floating_point() or value.layout != torch.strided:
+            kind = f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
+            raise InputError(f"{path}: {name} is {kind} where gsplat has float32 {shape}: export the model again")
+    if not count or bands not in BANDS:
+        raise InputError(
+            f"{path} holds {count} Gaussians whose shN has {bands} bands: export a model with harmonics of degree "
+            "0 .. 3, which has 0, 3, 8 or 15"
+        )
+    return Gaussians(**{name: splats[name].detach().double() for name in PARAMETER_NAMES})

@@ -27,11 +27,8 @@ OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def require_agreement(scene: Scene) -> None:
-    """Refuse a scene on which no training can work, by a bounded number of its pixels and points.
-
-    Raises:
-        InputError: the likely cause and the remedy.
-    """
+    """Raise `InputError`, with the likely cause and the remedy, for a scene on which no training can work, by a bounded
+    number of its pixels and points."""
     if cause := _contradiction(scene):
         raise InputError(f"'{scene.name}': {cause}; scene.force=true trains all the same")
 
@@ -69,10 +66,11 @@ def _contradiction(scene: Scene) -> str:
         return ""  # nothing says where the scene is
     poses = scene.frame.restore_poses(views.cameras.viewmats.cpu().numpy())  # [V, 4, 4]
     places, correlation = likeness(scene, poses)
-    unlike = places >= FEWEST_COLORS and correlation < LEAST_LIKENESS
-    if places >= min(FEWEST_PLACES, len(scene.points)) and not unlike:
+    what = "the cameras see no points"
+    if places >= FEWEST_COLORS and correlation < LEAST_LIKENESS:
+        what = "photos do not show the points where the cameras see them"
+    elif places >= min(FEWEST_PLACES, len(scene.points)):
         return ""
-    what = "photos do not show the points where the cameras see them" if unlike else "the cameras see no points"
     for other, remedy in (
         (OTHER_AXES @ poses, "multiply columns 2 and 3 of each camera-to-world matrix by -1 (its axes are others)"),
         (np.linalg.inv(poses), "invert each pose's matrix (camera to world is taken for world to camera)"),

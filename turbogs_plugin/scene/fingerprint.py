@@ -29,11 +29,8 @@ def frame_of_state(state: dict[str, Any]) -> Frame:
 
 
 def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
-    """The difference of a capture from a saved one, in words; empty where there is none.
-
-    Args:
-        saved, present: what `capture_state` gave, of one structure (`checkpoint.require_like`), among other things.
-    """
+    """The difference of a capture from a saved one, in words; empty where there is none. Both are what `capture_state`
+    gave, of one structure (`checkpoint.require_like`), among other things."""
     for split in ("train", "test"):
         before, now = saved[f"{split}_views"], present[f"{split}_views"]
         if before["names"] != now["names"]:
@@ -41,8 +38,9 @@ def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
         bounds = {"sizes": 0.0, "unmasked": 0.0, "Ks": ROUNDING * now["Ks"].abs(), "viewmats": ROUNDING}
         for key, bound in bounds.items():
             if before[key].shape != now[key].shape or not ((before[key] - now[key]).abs() <= bound).all():
-                what = {"unmasked": "masks", "sizes": "sizes"}.get(key, "cameras")
-                return f"other {what} of {split} images"
+                return (
+                    f"other {'masks' if key == 'unmasked' else key if key == 'sizes' else 'cameras'} of {split} images"
+                )
     first, frame = frame_of_state(saved), frame_of_state(present)
     moved = max(np.abs(first.center - frame.center).max(), abs(first.scale - frame.scale))
     return "other coordinates" if moved > ROUNDING * frame.scale else ""

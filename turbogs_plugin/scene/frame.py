@@ -16,12 +16,7 @@ from turbogs_plugin.errors import InputError
 
 @dataclass(frozen=True)
 class Frame:
-    """``capture = normalised * scale + center``, in float64.
-
-    Args:
-        center: [3] float64, the origin of the normalised frame in the capture's coordinates.
-        scale: capture units per normalised unit, positive.
-    """
+    """``capture = normalised * scale + center``, in float64: `center` [3], and a positive `scale`."""
 
     center: np.ndarray
     scale: float
@@ -36,15 +31,9 @@ class Frame:
 
     @classmethod
     def around(cls, camera_centers: np.ndarray, points: np.ndarray) -> Frame:
-        """The frame whose origin is the mean of the camera centres and whose unit is 1.1 times their largest distance
-        from it (the scene extent of 3DGS).
-
-        Where the cameras only turn on the spot, the median distance of the points takes the place of that radius.
-
-        Args:
-            camera_centers: [V, 3] float64, V >= 1.
-            points: [M, 3] float64, M >= 1.
-        """
+        """The frame whose origin is the mean of the camera centres [V, 3] and whose unit is 1.1 times their largest
+        distance from it (the scene extent of 3DGS); where the cameras only turn on the spot, the median distance of the
+        points [M, 3]. All in float64."""
         # Differences to one camera first: a mean of numbers near 10^6 would lose digits.
         center = camera_centers[0] + (camera_centers - camera_centers[0]).mean(axis=0)
         radius = np.linalg.norm(camera_centers - center, axis=1).max()
@@ -62,10 +51,8 @@ class Frame:
         return np.asarray(points, dtype=np.float64) * self.scale + self.center
 
     def normalise_poses(self, viewmats: np.ndarray) -> np.ndarray:
-        """[V, 4, 4] float64 world-to-camera matrices of the capture -> matrices of the normalised frame.
-
-        Camera coordinates shrink with the world, so rotations stay rotations and no projection changes.
-        """
+        """[V, 4, 4] float64 world-to-camera matrices of the capture -> matrices of the normalised frame. Camera
+        coordinates shrink with the world, so rotations stay rotations and no projection changes."""
         normalised = viewmats.copy()
         normalised[:, :3, 3] = (viewmats[:, :3, 3] + viewmats[:, :3, :3] @ self.center) / self.scale
         return normalised

@@ -20,16 +20,9 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 def viewmat_of_pose(axes: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """[4, 4] float64 world to camera of a camera's place in the world.
-
-    Args:
-        axes: [3, 3] float64, whose columns are the camera's axes in the world: right, down, forward. Decimals that were
-            cut when it was written are made up for: the nearest rotation is taken.
-        center: [3] float64.
-
-    Raises:
-        ValueError: the numbers are not finite, or the axes not a rotation.
-    """
+    """[4, 4] float64 world to camera of a camera's place `center` [3] in the world, and its axes there, right, down,
+    forward: the columns of `axes` [3, 3]. Decimals that were cut when they were written are made up for: the nearest
+    rotation is taken. Raises `ValueError` for numbers that are not finite, and axes that are no rotation."""
     if not (np.isfinite(axes).all() and np.isfinite(center).all()):
         raise ValueError("has numbers that are not finite")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -43,20 +36,14 @@ def viewmat_of_pose(axes: np.ndarray, center: np.ndarray) -> np.ndarray:
 
 
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """[4, 4] float64 world to camera of a camera at `center` with `target` in the middle of its image.
-
-    Args:
-        center, target: [3] float64.
-        up: [3], not parallel to the view; it points upwards in the image.
-    """
+    """[4, 4] float64 world to camera of a camera at `center` [3] with `target` [3] in the middle of its image.
+    `up` [3], which is not parallel to the view, points upwards there."""
     forward = target - center
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    viewmat[:3, 3:] = -viewmat[:3, :3] @ center[:, None]
-    return viewmat
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.block([[rotation, -rotation @ center[:, None]], [np.eye(1, 4, 3)]])
 
 
 def quaternions(matrices: np.ndarray) -> np.ndarray:
@@ -67,12 +54,8 @@ def quaternions(matrices: np.ndarray) -> np.ndarray:
 
 
 def mean_neighbor_distances(points: Tensor, neighbors: int) -> Tensor:
-    """[M]: mean distance of each point to its `neighbors` nearest other points (fewer, if the cloud has fewer).
-
-    Args:
-        points: [M, 3] float, finite, M >= 2, on any device. Points may coincide.
-        neighbors: at least 1.
-    """
+    """[M]: mean distance of each point [M, 3], M >= 2, to its `neighbors` nearest other points (fewer, if the cloud has
+    fewer). Points are finite, and may coincide."""
     from scipy.spatial import cKDTree
 
     places = points.cpu()

@@ -26,17 +26,9 @@ LARGE_FILES = Path("/var/tmp")
 
 
 def host_array(shape: Sequence[int], dtype: torch.dtype, what: str) -> Tensor:
-    """An array of the host with any content, in a file where it is larger than `MEMORY_SHARE` of the free memory.
-
-    The file lies in ``TMPDIR``, else in /var/tmp. It has no name any more, so it is gone with the array, whatever ends
-    the process.
-
-    Args:
-        what: names the array in messages.
-
-    Raises:
-        InputError: it fits neither in memory nor on the disk.
-    """
+    """An array of the host with any content, in a file where it is larger than `MEMORY_SHARE` of the free memory. The
+    file lies in ``TMPDIR``, else in /var/tmp, and has no name any more: it is gone with the array, whatever ends the
+    process. `InputError`, about `what`, where the array fits neither in memory nor on the disk."""
     elements = math.prod(map(int, shape))
     size = elements * dtype.itemsize
     if not too_large(size):
@@ -75,8 +67,7 @@ def read_ahead(arrays: Sequence[Tensor]) -> None:
     for array in arrays:
         if array.numel() and in_file(array):
             start = array.data_ptr() // page * page
-            length = array.data_ptr() + array.nbytes - start
-            # Advice: it may fail.
+            length = array.data_ptr() + array.nbytes - start  # advice may fail:
             ctypes.CDLL(None).madvise(ctypes.c_void_p(start), ctypes.c_size_t(length), mmap.MADV_WILLNEED)
 
 

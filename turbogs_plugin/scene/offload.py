@@ -2,7 +2,7 @@
 
 For every array over flat pixels the device has a *window*: slots, each as large as the largest view, for the views of
 the present iteration and of the one before. The kernels see a flat array and the first pixel of each view, as always;
-only these first pixels change from iteration to iteration.
+only these first pixels change from iteration to iteration. Results equal, bit for bit, those without a window.
 
 Only the device waits for copies. There are two sets of slots: the views of an iteration are copied in while the device
 still works on the iteration before, whose changed maps are copied out while the device works on this one. The order is:
@@ -10,8 +10,6 @@ still works on the iteration before, whose changed maps are copied out while the
 - copy in: after the last work that used the slot, and after its old content has been copied out;
 - copy out: after the work that changed the slot, as soon as the next views are asked for;
 - work on a slot: after its view has been copied in.
-
-The results equal, bit for bit, results with maps and photos on the device.
 
 What does not fit in host memory either lies in a file (`scene/host_arrays.py`): the disk reads the views of an
 iteration all at once, and the host waits for them.
@@ -47,8 +45,7 @@ class ViewWindow:
 
     Args:
         stores: arrays of one length [X, ...] in host memory. They are page-locked where they lie while the window
-            exists, if there is a GPU to do that; without, and where they lie in files, copies are slower and all else
-            is the same.
+            exists, if there is a GPU to do that; without, and where they lie in files, copies are slower.
         sizes: [V, 2] int64 numpy array (width, height) of the views laid end to end in them.
         device: of the window. On a CPU, copies are made at once.
         written: the arrays are changed in the window, so views travel back as well.
@@ -61,7 +58,7 @@ class ViewWindow:
         self.device = torch.device(device)
         self.written = written
         self.offsets = np.full(len(sizes), ABSENT, dtype=np.int64)
-        self._stores = tuple(stores)
+        self.stores = tuple(stores)
         self._starts = pixel_offsets(sizes)  # [V + 1]
         self._slot_pixels = int(sizes.prod(axis=1).max())
         self._used: set[int] = set()
@@ -113,7 +110,7 @@ class ViewWindow:
         self._release()
         self._write_back(list(self._changed))
         synchronize(self.device)
-        return self._stores
+        return self.stores
 
     def change_all(self, index: int, function: Callable[[Tensor], Tensor]) -> None:
         """Replace every element of one array by a function of it, in the window as well."""
@@ -128,7 +125,7 @@ class ViewWindow:
     def load(self, values: Sequence[Tensor]) -> None:
         """Replace the whole arrays; the window is empty afterwards."""
         self.flush()
-        for store, value in zip(self._stores, values, strict=True):
+        for store, value in zip(self.stores, values, strict=True):
             store.copy_(value)
         self._allocate(len(self._released))
 
@@ -138,7 +135,7 @@ class ViewWindow:
         self._arrays = ()  # freed before its successor is made
         self._arrays = tuple(
             torch.zeros(slots * self._slot_pixels + 1, *store.shape[1:], dtype=store.dtype, device=self.device)
-            for store in self._stores
+            for store in self.stores
         )
         self.offsets[:] = ABSENT
         self._slot_of: dict[int, int] = {}  # of the views in the window, the latest in use last
@@ -177,12 +174,12 @@ class ViewWindow:
         """(window, store) of one view, of each array."""
         first = int(self.offsets[view])
         both = zip(self._arrays, self._outside(view), strict=True)
-        return [(array[first : first + len(outside)], outside) for array, outside in both]
+        return [(array[first:][: len(outside)], outside) for array, outside in both]
 
     def _outside(self, view: int) -> list[Tensor]:
         """The part of each store that is one view's."""
         start, end = self._starts[view : view + 2].tolist()
-        return [store[start:end] for store in self._stores]
+        return [store[start:end] for store in self.stores]
 
 
 class _Windowed:
@@ -200,28 +197,21 @@ class _Windowed:
 
 
 class OffloadedPhotos(_Windowed, Photos):
-    """Photos in host memory, with a window on a device; `colors` and `offsets` are the window's.
-
-    Args:
-        photos: in host memory.
-        device: of the window.
-    """
+    """Photos in host memory, with a window on a device; `colors` and `offsets` are the window's."""
 
     def __init__(self, photos: Photos, device: torch.device | str) -> None:
         self.sizes = photos.sizes
-        self._stored = photos.stored.cpu()
-        self._window = ViewWindow((self._stored,), photos.sizes, device, written=False)
+        self._window = ViewWindow((photos.stored.cpu(),), photos.sizes, device, written=False)
 
     @property
     def stored(self) -> Tensor:
-        return self._stored
+        return self._window.stores[0]
 
     @property
     def colors(self) -> Tensor:  # type: ignore[override]  # read-only: the window's
         return self._window.arrays[0][:-1]
 
     def to(self, device: torch.device | str) -> OffloadedPhotos:
-        """The photos with a window on a device."""
         return self if torch.device(device) == self._window.device else OffloadedPhotos(self, device)
 
 
@@ -270,11 +260,7 @@ def place_views(views: PosedImages, device: torch.device, place: str) -> PosedIm
 
 
 class _CopyStream:
-    """Copies in one direction, beside the computation; on a CPU, at once.
-
-    Attributes:
-        latest: the end of the copies begun so far; empty where there were none.
-    """
+    """Copies in one direction, beside the computation; on a CPU, at once. `latest` is the end of those begun so far."""
 
     def __init__(self, device: torch.device) -> None:
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
@@ -312,14 +298,12 @@ def _wait(device: torch.device, events: Sequence[torch.cuda.Event]) -> None:
 
 
 def _page_lock(window: ViewWindow) -> None:
-    """Lock the stores in memory, in place, until the window is gone.
-
-    torch's own pinned memory would be a copy, rounded up to a power of two. Memory that another window has locked stays
-    as that one has it. A file's is left alone: locked, all of it would have to be in memory.
-    """
+    """Lock the stores in memory, in place, until the window is gone: torch's own pinned memory would be a copy, rounded
+    up to a power of two. Memory that another window has locked stays as that one has it. A file's is left alone:
+    locked, all of it would have to be in memory."""
     runtime = torch.cuda.cudart()
     locked = []
-    for store in window._stores:
+    for store in window.stores:
         if in_file(store) or store.is_pinned():
             continue
         if int(runtime.cudaHostRegister(store.data_ptr(), store.nbytes, 0)) == 0:

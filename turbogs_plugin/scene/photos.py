@@ -23,7 +23,7 @@ class Photos:
     Args:
         colors: [X, 3] uint8, row-major pixels of one view after the other. Or [X, 4] where photos are transparent:
             colours times alpha, and alpha; the background shows through them.
-        sizes: [V, 2] int64 numpy array (width, height).
+        sizes: [V, 2] int64, (width, height).
     """
 
     colors: Tensor
@@ -48,10 +48,8 @@ class Photos:
         return self.stored.shape[1] == 4
 
     def fetch(self, view_ids: Sequence[int]) -> None:
-        """Make the photos of these views available in `colors`, from `offsets` on.
-
-        Call it before reading these arrays. Here all views are always there; see `scene/offload.py`.
-        """
+        """Make the photos of these views available in `colors`, from `offsets` on. To be called before these arrays are
+        read. Here all views are always there; see `scene/offload.py`."""
 
     def at(self, samples: PixelSamples, background: Color = BLACK) -> PhotoSamples:
         """The photos at the samples, on a background. To be used before the photos of other views are fetched."""
@@ -62,8 +60,7 @@ class Photos:
         """[H, W, 3] float32, 0 .. 1: one whole photo, on a background."""
         self.fetch([view_id])
         width, height = self.sizes[view_id].tolist()
-        start = int(self.offsets[view_id])
-        pixels = self.colors[start : start + width * height]
+        pixels = self.colors[int(self.offsets[view_id]) :][: width * height]
         return _on_background(pixels, background).view(height, width, 3)
 
     def to(self, device: torch.device | str) -> Photos:

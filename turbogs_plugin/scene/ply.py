@@ -20,11 +20,8 @@ class _AsciiLines(io.BufferedReader):
 def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
     """The ``vertex`` element of a .ply: property -> [N] values in the file's own type, in the file's order.
 
-    trimesh allocates nothing before the file is known to be long enough for what its header announces.
-
-    Raises:
-        InputError: no such file, not a .ply, or a header or a body that is not as announced.
-    """
+    trimesh allocates nothing before the file is known to be long enough for what its header announces. Raises
+    `InputError` where there is no such file, or its header or body is not as announced."""
     from trimesh.exchange.ply import load_ply  # its import takes a second
 
     try:
@@ -45,14 +42,11 @@ def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def read_colors(path: Path, vertices: dict[str, np.ndarray]) -> np.ndarray | None:
-    """[N, 3] uint8 red, green and blue of the vertices; None where there are none.
+    """[N, 3] uint8 red, green and blue of the vertices; None where there are none. `InputError` unless finite.
 
     Numbers of 8 bits are taken as they are. The type of others does not say what white is. Of whole numbers it is
     65535 where one is above 255. Of floats it is 1, unless their mean is above that: a few may be a bit above white.
     Otherwise it is 255.
-
-    Raises:
-        InputError: colours that are not finite.
     """
     channels = ("red", "green", "blue")
     if not set(channels) <= set(vertices):
@@ -64,8 +58,7 @@ def read_colors(path: Path, vertices: dict[str, np.ndarray]) -> np.ndarray | Non
     bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
         raise InputError(f"{path}: the colours of {bad.sum()} of {len(values)} points are not finite: export it again")
-    if np.issubdtype(given.dtype, np.floating):
+    white = 65535.0 if values.max() > 255.0 else 255.0
+    if given.dtype.kind == "f":
         white = 1.0 if values.mean() <= 1.0 else 255.0
-    else:
-        white = 65535.0 if values.max() > 255.0 else 255.0
     return np.rint((values / white * 255.0).clip(0.0, 255.0)).astype(np.uint8)

@@ -16,28 +16,18 @@ from turbogs_plugin.types import Cameras
 
 @dataclass(frozen=True)
 class Observations:
-    """Places where V photos show points.
+    """Places where V photos show points; the centre of a photo's first pixel is (0.5, 0.5)."""
 
-    Args:
-        pixels: [O, 2] float64; the centre of the first pixel is (0.5, 0.5).
-        view_ids: [O] int64, ascending.
-        point_ids: [O] int64.
-    """
-
-    pixels: np.ndarray
-    view_ids: np.ndarray
-    point_ids: np.ndarray
+    pixels: np.ndarray  # [O, 2] float64
+    view_ids: np.ndarray  # [O] int64, ascending
+    point_ids: np.ndarray  # [O] int64
 
     def __len__(self) -> int:
         return len(self.pixels)
 
     def of_views(self, views: np.ndarray, ratios: np.ndarray) -> Observations:
-        """The observations by some views, which become the first, second, ...; in pixels of photos of another size.
-
-        Args:
-            views: [W] int64, ascending.
-            ratios: [W, 2], their new width and height over those before.
-        """
+        """The observations by some views ([W] int64, ascending), which become the first, second, ...; in pixels of
+        photos of another size, by the `ratios` [W, 2] of width and height."""
         starts, ends = (np.searchsorted(self.view_ids, views, side) for side in ("left", "right"))
         rows = np.concatenate([np.arange(*ends_of) for ends_of in zip(starts, ends, strict=True)] or [starts])
         now = np.repeat(np.arange(len(views)), ends - starts)
@@ -54,8 +44,7 @@ class PosedImages:
         photos: their pixels.
         masks: which pixels count, on the CPU; None for all.
         observations: where the photos show the scene's points; None: the capture does not say.
-        refined: other cameras of the same photos, which agree better with what is trained on (`refine_cameras`); None:
-            there are none.
+        refined: other cameras of the photos, which agree better with what is trained on (`refine_cameras`), if any.
     """
 
     cameras: Cameras

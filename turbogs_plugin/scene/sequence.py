@@ -14,13 +14,9 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Neighbours:
-    """The known photos that were taken before and after each of W photos.
-
-    Args:
-        rows: [W, 2] int64, which of the known photos.
-        weights: [W, 2] float32: of two neighbours, the nearer one weighs more, and both sum to 1; an only one has 1;
-            where there is none, both are 0.
-    """
+    """The known photos that were taken before and after each of W photos: [W, 2] int64 `rows` of the known photos, and
+    [W, 2] float32 `weights`. Of two neighbours, the nearer one weighs more, and both sum to 1; an only one has 1; where
+    there is none, both are 0."""
 
     rows: Tensor
     weights: Tensor
@@ -32,15 +28,11 @@ class Neighbours:
 
 
 def neighbours(names: Iterable[str], known: Sequence[str], photos: Sequence[str]) -> Neighbours:
-    """The nearest known photos before and after each photo; none is its own neighbour.
+    """The nearest known photos before and after each of `photos`; none is its own neighbour. `names` are of all photos,
+    with their folders, in which numbers count as numbers.
 
-    The photos of one folder are taken for one sequence: cameras, and programs that cut videos, number what they write.
-
-    Args:
-        names: of all photos, with their folders. Their order is by folder, and numbers in them count as numbers.
-        known: names of the photos of which something is known.
-        photos: names of those whose neighbours are wanted.
-    """
+    The photos of one folder are taken for one sequence: cameras, and programs that cut videos, number what they
+    write."""
     ordered = sorted(set(names), key=_key)
     places = {name: place for place, name in enumerate(ordered)}
     folders = np.unique([_folder(name) for name in ordered], return_inverse=True)[1]  # of each place

@@ -2,7 +2,7 @@
 
 A model from a file is taken to be in its capture's own coordinates, or where its points lie by nerfstudio's file beside
 it (`turbogs_plugin.model.placement`). gsplat's example trainer works in others unless it is told not to
-(`turbogs_plugin.model.gsplat_world`); `train.init_world` says which.
+(`turbogs_plugin.model.placement`); `train.init_world` says which.
 """
 
 from __future__ import annotations
@@ -21,11 +21,9 @@ from torch import Tensor
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
-from turbogs_plugin.model.gsplat_file import read_gsplat
-from turbogs_plugin.model.gsplat_world import gsplat_worlds
-from turbogs_plugin.model.placement import TRANSFORMS, nearest_change, out_of_nerfstudio
+from turbogs_plugin.model.placement import TRANSFORMS, gsplat_worlds, nearest_change, out_of_nerfstudio
 from turbogs_plugin.model.similarity import Similarity, local_origin, placed
-from turbogs_plugin.model.torch_file import read_plain
+from turbogs_plugin.model.torch_file import read_gsplat, read_plain
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.fingerprint import frame_of_state
 from turbogs_plugin.train.checkpoint import COUNT_LIMIT, latest_checkpoint, load_checkpoint

@@ -21,8 +21,8 @@ from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.model.gsplat_file import read_gsplat
 from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points, with_degree
+from turbogs_plugin.model.torch_file import read_gsplat
 from turbogs_plugin.plan.memory import cap_of
 from turbogs_plugin.plan.photo_gains import compare_exposures
 from turbogs_plugin.scene import PosedImages, Scene

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from turbogs_plugin.engine.reference.projection import rotation_matrices
-from turbogs_plugin.scene.geometry import quaternions
+from turbogs_plugin.scene.geometry import camera_centers, quaternions, viewmat_of_pose
 from turbogs_plugin.types import Cameras
 
 SMALLEST_SIDE, LARGEST_SIDE = 16, 1920
@@ -22,13 +22,12 @@ FOV_LIMITS = (math.radians(1.0), math.radians(170.0))
 
 @dataclass(frozen=True)
 class ViewerCamera:
-    """A pinhole camera whose principal point is the middle of its image.
+    """A pinhole camera whose principal point is the middle of its image of `width` and `height` pixels.
 
     Args:
         position: in the model's world.
         wxyz: unit quaternion of the rotation from the camera (x right, y down, z forward) to the world.
         fov: vertical, radians.
-        width, height: of the image, pixels.
     """
 
     position: tuple[float, float, float]
@@ -59,10 +58,10 @@ class ViewerCamera:
     @classmethod
     def of_view(cls, cameras: Cameras, view_id: int) -> ViewerCamera:
         """The camera of a capture's view; the principal point moves to the centre."""
-        viewmat = cameras.viewmats[view_id].double().cpu().numpy()
-        rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
+        viewmat = cameras.viewmats[view_id, None].double().cpu().numpy()
         fov = 2.0 * math.atan(cameras.sizes[view_id, 1] / (2.0 * float(cameras.Ks[view_id, 1, 1])))
-        return cls._of(-rotation.T @ translation, quaternions(rotation.T[None])[0], fov, cameras.sizes[view_id])
+        turn = quaternions(viewmat[:, :3, :3].transpose(0, 2, 1))[0]
+        return cls._of(camera_centers(viewmat)[0], turn, fov, cameras.sizes[view_id])
 
     @classmethod
     def _of(cls, position: np.ndarray, wxyz: np.ndarray, fov: float, size: np.ndarray) -> ViewerCamera:
@@ -71,7 +70,7 @@ class ViewerCamera:
 
     @property
     def rotation(self) -> np.ndarray:
-        """The rotation from the camera to the world, [3, 3] float64."""
+        """[3, 3] float64, from the camera to the world."""
         return rotation_matrices(torch.tensor(self.wxyz, dtype=torch.float64)).numpy()
 
     def with_at_most(self, pixels: float) -> ViewerCamera:
@@ -82,10 +81,7 @@ class ViewerCamera:
 
     def cameras(self, device: torch.device) -> Cameras:
         """The camera as one of `Cameras`, float32 on a device."""
-        to_camera = self.rotation.T
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = to_camera
-        viewmat[:3, 3] = -to_camera @ np.array(self.position)
+        viewmat = viewmat_of_pose(self.rotation, np.array(self.position))
         focal = self.height / (2.0 * math.tan(self.fov / 2.0))
         K = np.array([[focal, 0.0, self.width / 2.0], [0.0, focal, self.height / 2.0], [0.0, 0.0, 1.0]])
         viewmats, Ks = (torch.from_numpy(array[None]).float().to(device) for array in (viewmat, K))

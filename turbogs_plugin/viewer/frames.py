@@ -29,15 +29,11 @@ FEWEST_PIXELS = 160 * 120
 
 class Frames:
     """Draws the frames that are due, one a call, on the thread that calls. All pages show what the camera that moved
-    last sees.
+    last sees. `about` is a line about the last frame.
 
     Args:
         send: encodes a picture [H, W, 3] uint8, without loss or not, and sends it.
         wish: gives the picture and the view that the pages show.
-        clock: seconds.
-
-    Attributes:
-        about: a line about the last frame.
     """
 
     def __init__(
@@ -59,15 +55,12 @@ class Frames:
             self.camera, self._moved_at = camera, self.clock()
 
     def serve(self, state: Callable[[], ModelState], version: int, running: bool) -> bool:
-        """Draw and send a frame, if one is due.
+        """Draw and send a frame, if one is due, and say whether one was.
 
         Args:
             state: what to draw; called only if something is drawn, before the frame's time begins.
             version: changes whenever a picture may look different.
             running: a training waits for the frame.
-
-        Returns:
-            Whether a frame was drawn.
         """
         now, camera = self.clock(), self.camera
         if camera is None or now < self._sent_at + SHORTEST_INTERVALS[running] or (running and now < self.next_at):
@@ -94,10 +87,10 @@ class Frames:
 
     def _sized(self, camera: ViewerCamera, moving: bool, running: bool) -> ViewerCamera:
         """The camera with as many pixels as `FRAME_SECONDS` allows, in steps of a factor 2."""
-        allowed = float(FEWEST_PIXELS) if moving or running else math.inf  # where nothing is known yet
+        allowed = 0.0 if moving or running else math.inf  # where nothing is known yet
         if self._per_pixel is not None:
-            allowed = max(float(FEWEST_PIXELS), FRAME_SECONDS[running, moving] / max(self._per_pixel, 1e-12))
+            allowed = FRAME_SECONDS[running, moving] / max(self._per_pixel, 1e-12)
         pixels = float(camera.width * camera.height)
-        while pixels > allowed:
+        while pixels > max(FEWEST_PIXELS, allowed):
             pixels /= 2
         return camera.with_at_most(pixels)

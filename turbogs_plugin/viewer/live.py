@@ -21,11 +21,7 @@ from turbogs_plugin.viewer.server import POLL_SECONDS, Page, serve_until_interru
 
 
 class LiveViewer(Listener):
-    """Shows a training on a page, and waits where the page asks for it.
-
-    Args:
-        page: with controls of a training.
-    """
+    """Shows a training on a page with its controls, and waits where the page asks for it."""
 
     def __init__(self, page: Page) -> None:
         self.page = page
@@ -59,7 +55,7 @@ class LiveViewer(Listener):
         """Show the model after the training until Ctrl-C."""
         trainer = self.trainer
         assert trainer is not None, "no training was watched"
-        self.page.finished()
+        self.page.training.visible = False
         serve_until_interrupted(self.page, lambda: self._serve(trainer, running=False))
 
     def _hold(self, loop: TrainingLoop) -> None:

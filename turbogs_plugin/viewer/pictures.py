@@ -25,8 +25,7 @@ from turbogs_plugin.viewer.camera import ViewerCamera
 
 BACKGROUND = 24
 """Grey level where a picture has nothing to show."""
-DIMMED = 0.4
-"""Brightness of what is there for orientation only."""
+DIMMED = 0.4  # of what is there for orientation only
 SAMPLED = (255, 170, 0)
 
 
@@ -47,11 +46,7 @@ class Picture(str, Enum):
 
 @dataclass(frozen=True)
 class CaptureViews:
-    """The views of a capture under one numbering: training views, then test views.
-
-    Args:
-        train, test: cameras and photos, wherever their photos are kept.
-    """
+    """The views of a capture under one numbering: training views, then test views; wherever their photos are kept."""
 
     train: PosedImages
     test: PosedImages
@@ -77,7 +72,6 @@ class ModelState:
     Args:
         gaussians: the model, on the device that renders.
         look: how it is shown, without exposures.
-        capture: its views, for training and for testing.
         maps: errors and ages of the training views, and the time from which ages count.
         samples: pixels of the last iteration.
     """
@@ -99,30 +93,23 @@ def draw(state: ModelState, picture: Picture, camera: ViewerCamera, view: int = 
 
     Args:
         camera: the page's camera; its size is the picture's.
-        view: number of a view of the capture, see `CaptureViews`; taken within its bounds.
+        view: number of a view of the capture, see `CaptureViews`; taken within its bounds. Samples are shown where they
+            fell: in this view if it was sampled in this iteration, else in the first one that was.
     """
     try:
         if picture is Picture.RENDER:
             return _render(state, camera), ""
-        number = shown_view(state, picture, view)
+        number = min(max(0, view), len(_capture(state)) - 1)
+        if picture is Picture.SAMPLES and state.samples is not None and number not in state.samples.view_ids:
+            number = state.samples.view_ids[0]
         draw_view = {Picture.COMPARE: _compare, Picture.SAMPLES: _samples, Picture.AGES: _ages}.get(picture, _errors)
         return _centred(draw_view(state, camera, number), camera), _capture(state).name(number)
     except AbsentError as reason:
-        return np.full((camera.height, camera.width, 3), BACKGROUND, dtype=np.uint8), str(reason)
-
-
-def shown_view(state: ModelState, picture: Picture, view: int) -> int:
-    """The view that a picture of a view shows. Samples are shown where they fell: in the chosen view if it was sampled
-    in this iteration, else in the first one that was."""
-    view = min(max(0, view), len(_capture(state)) - 1)
-    if picture is Picture.SAMPLES and state.samples is not None and view not in state.samples.view_ids:
-        return state.samples.view_ids[0]
-    return view
+        return _centred(torch.zeros(0, 0, 3), camera), str(reason)
 
 
 def _render(state: ModelState, camera: ViewerCamera) -> np.ndarray:
-    cameras = camera.cameras(state.gaussians.device)
-    return to_uint8(render_image(state.gaussians, cameras, **state.look.options).colors)
+    return to_uint8(render_image(state.gaussians, camera.cameras(state.gaussians.device), **state.look.options).colors)
 
 
 def _compare(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
@@ -130,7 +117,7 @@ def _compare(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
     views, view_id = _capture(state).find(number)
     views = views.with_cameras_on(state.gaussians.device)
     image = render_view(state.gaussians, views, view_id, state.look)
-    pixels = strip(_photo(state, views, view_id), image, views.mask(view_id))
+    pixels = strip(_photo(state, number), image, views.mask(view_id))
     return _fitted(pixels.permute(2, 0, 1).float(), camera).permute(1, 2, 0).round().byte()
 
 
@@ -152,7 +139,7 @@ def _samples(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
     samples = state.samples
     if samples is None:
         raise AbsentError("No samples yet: they are drawn by a running training.")
-    photo = _photo(state, *_capture(state).find(number))
+    photo = _photo(state, number)
     sampled = torch.zeros_like(photo[..., 0])  # [H, W]
     chosen = samples.view_of_slot() == samples.view_ids.index(number)
     sampled.view(-1)[samples.pixel_ids[chosen & samples.filled].long()] = 1.0
@@ -173,15 +160,15 @@ def _maps(state: ModelState, number: int) -> tuple[ErrorMaps, Step]:
     return state.maps
 
 
-def _photo(state: ModelState, views: PosedImages, view_id: int) -> Tensor:
+def _photo(state: ModelState, number: int) -> Tensor:
     """A photo on the model's device, [H, W, 3] float32, 0 .. 1."""
+    views, view_id = _capture(state).find(number)
     return views.photos.image(view_id, state.look.background).to(state.gaussians.device)
 
 
 def _map_picture(shares: Tensor, size: np.ndarray, camera: ViewerCamera) -> Tensor:
     """A map [H * W] of a view of (width, height), in colours; what is reduced keeps its largest values."""
-    plane = shares.view(1, int(size[1]), int(size[0]))
-    return colored(_fitted(plane, camera, keep_largest=True)[0])
+    return colored(_fitted(shares.view(1, size[1], size[0]), camera, keep_largest=True)[0])
 
 
 def _fitted(planes: Tensor, camera: ViewerCamera, keep_largest: bool = False) -> Tensor:

@@ -14,7 +14,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import urlsplit
 
@@ -34,8 +34,10 @@ POLL_SECONDS = 0.02
 INSTALL = 'pip install "viser>=1.1,<2"'
 
 
-def quiet_server(host: str, port: int) -> viser.ViserServer:
-    """A viser server that says nothing on standard output, which is the command's. Port 0 takes any free one.
+@contextlib.contextmanager
+def quiet_server(host: str, port: int) -> Iterator[viser.ViserServer]:
+    """While entered, a viser server that says nothing on standard output, which is the command's, and answers to its
+    own names alone (`_guarded`). Port 0 takes any free one.
 
     Raises:
         InputError: viser is not installed, or no server can listen there (viser itself would take another port).
@@ -49,14 +51,14 @@ def quiet_server(host: str, port: int) -> viser.ViserServer:
     except (OSError, OverflowError, UnicodeError) as error:
         reason = (isinstance(error, OSError) and error.strerror) or error
         raise InputError(f"the viewer cannot listen at {host}:{port} ({reason}): name another port or host") from None
-    with contextlib.redirect_stdout(io.StringIO()):
-        return viser.ViserServer(host=host, port=port, label="TurboGS", verbose=False)
-
-
-def stop(server: viser.ViserServer) -> None:
-    """End a server without a word on standard output."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
+    with contextlib.redirect_stdout(io.StringIO()), _guarded(host):
+        server: Any = viser.ViserServer(host=host, port=port, label="TurboGS", verbose=False)
+    server.request_share_url = lambda *arguments, **options: None  # a tunnel into the internet
+    try:
+        yield server
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
 
 
 def quoted(name: str) -> str:
@@ -65,26 +67,22 @@ def quoted(name: str) -> str:
 
 
 class Page:
-    """A web page that shows frames and takes wishes.
+    """A web page that shows frames and takes wishes, as of `quiet_server`.
 
     Args:
-        host: interface to listen at.
-        port: 0 takes any free one.
         training: whether there is a training to control.
 
     Attributes:
         paused: whether the training is asked to wait. It waits only while a page is open.
         steps: iterations that a paused training is asked for.
-
-    Raises:
-        InputError: viser is not installed, or the port is not free.
+        training: the controls of a training.
     """
 
     def __init__(self, host: str, port: int, training: bool = False) -> None:
         self.capture: CaptureViews | None = None
         self.frames = Frames(self._send, self.wish)
-        self.server = quiet_server(host, port)
-        _guard(self.server, host)
+        self._opened = contextlib.ExitStack()
+        self.server = self._opened.enter_context(quiet_server(host, port))
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self.server.gui.main_panel.dock_right()
         host = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
@@ -95,8 +93,8 @@ class Page:
         self._pictures = gui.add_dropdown("Picture", names, initial_value=names[0])
         self._slider = gui.add_slider("View", 0, 1, 1, 0, visible=False)
         self._there = gui.add_button("Stand at this view", visible=False)
-        self._training = gui.add_folder("Training", visible=training)
-        with self._training:
+        self.training = gui.add_folder("Training", visible=training)
+        with self.training:
             self._pause = gui.add_button("Pause")
             self._step = gui.add_button("One step")
         self._there.on_click(lambda _: self.go_to(self._slider.value))
@@ -107,7 +105,6 @@ class Page:
 
     @property
     def watched(self) -> bool:
-        """Whether anybody looks."""
         return bool(self.server.get_clients())
 
     def wish(self) -> tuple[Picture, int]:
@@ -125,8 +122,8 @@ class Page:
         self.capture = capture
         cameras = capture.train.cameras
         up = -cameras.viewmats[:, 1, :3].double().mean(dim=0).cpu().numpy()
-        if np.linalg.norm(up) > 1e-3:
-            self.server.scene.set_up_direction(tuple(up / np.linalg.norm(up)))
+        if (length := np.linalg.norm(up)) > 1e-3:
+            self.server.scene.set_up_direction(tuple(up / length))
         self._slider.max = max(1, len(capture) - 1)
         self._slider.visible = self._there.visible = True
         self.stand_at(ViewerCamera.of_view(cameras, 0))
@@ -155,13 +152,9 @@ class Page:
             views, view_id = self.capture.find(number)
             self.stand_at(ViewerCamera.of_view(views.cameras, view_id))
 
-    def finished(self) -> None:
-        """Hide the controls of a training that has ended."""
-        self._training.visible = False
-
     def close(self) -> None:
         """Turn everybody away."""
-        stop(self.server)
+        self._opened.close()
 
     # viser runs asynchronous functions one after the other, in the order of the clicks; others in any order.
     async def _pause_clicked(self, event: object) -> None:
@@ -207,31 +200,42 @@ class _OneLine(logging.Handler):
             print("turbogs: the viewer turned a client away that sent what is no message", file=sys.stderr, flush=True)
 
 
-def _guard(server: Any, host: str) -> None:
-    """Take from clients what viser would let them do: open a tunnel into the internet, which would make the page
-    public; look from any web page that a browser on this machine has open, under whatever name (`_own_name`); and fill
-    stderr."""
-    server.request_share_url = lambda *arguments, **options: None
-    sockets = server._websock_server
-    logger = logging.getLogger("websockets.server")
+@contextlib.contextmanager
+def _guarded(host: str) -> Iterator[None]:
+    """While entered, a viser server begins that refuses its page and its socket to a foreign name (`_own_name`) and to
+    scripts of foreign pages that a browser on this machine has open, and that does not fill stderr.
+
+    Raises:
+        InputError: this viser serves otherwise.
+    """
+    from websockets.asyncio import server as sockets
+
+    logger, serve, guarded = logging.getLogger("websockets.server"), sockets.serve, []
     logger.handlers, logger.propagate = [_OneLine(logging.NOTSET)], False
 
-    async def refuse_foreign_pages(client: Any) -> None:
-        connection = sockets._live_connections[client.client_id]
-        origins, hosts = (connection.request.headers.get_all(name) for name in ("Origin", "Host"))
-        own = len(hosts) == 1 and _own_name(hosts[0], host)
-        if not own or any(urlsplit(origin).netloc != hosts[0] for origin in origins):
-            await connection.close(1008, "another page's script")
+    def serve_own(*arguments: Any, process_request: Callable, **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            origins, hosts = (request.headers.get_all(name) for name in ("Origin", "Host"))
+            own = len(hosts) == 1 and _own_name(hosts[0], host)
+            if not own or any(urlsplit(origin).netloc != hosts[0] for origin in origins):
+                return connection.respond(403, "This page has another name.\n")
+            return process_request(connection, request)
 
-    sockets.on_client_connect(refuse_foreign_pages)
+        guarded.append(host)
+        return serve(*arguments, process_request=answer, **options)
+
+    sockets.serve = serve_own  # type: ignore[assignment,misc]  # viser takes no answer of ours
+    try:
+        yield
+    finally:
+        sockets.serve = serve  # type: ignore[misc]
+    if not guarded:
+        raise InputError(f"this version of viser cannot be kept from foreign pages: {INSTALL}")
 
 
 def serve_until_interrupted(page: Page, serve: Callable[[], bool]) -> None:
-    """Say on standard output where the page is, and serve it until Ctrl-C.
-
-    Args:
-        serve: draws a frame if one is due, and says whether it did.
-    """
+    """Say on standard output where the page is, and serve it until Ctrl-C: `serve` draws a frame if one is due, and
+    says whether it did."""
     with contextlib.suppress(KeyboardInterrupt):
         print(f"viewer  {page.url}  (Ctrl-C ends)", flush=True)
         while True:

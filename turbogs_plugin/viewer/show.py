@@ -21,18 +21,7 @@ from turbogs_plugin.viewer.server import Page, quoted, serve_until_interrupted
 
 
 def view(path: Path, port: int, host: str, device_name: str, given: Config | None = None) -> None:
-    """Show a run's newest model, or one from a file, until Ctrl-C.
-
-    Args:
-        path: folder of a run, or the file of a model.
-        port, host: where to listen.
-        device_name: where to render.
-        given: the capture of a model from a file, and how to render it; None: a run knows its own, and a file is shown
-            without one.
-
-    Raises:
-        InputError: no model there, viser is not installed, or the port is not free.
-    """
+    """Show the model of `open_state` until Ctrl-C. `InputError`, too, where no page can be opened (`Page`)."""
     with closing(Page(host, port)) as page:
         state = open_state(path, resolve_device(device_name), given)
         serve_until_interrupted(page, server_of(state, path.name, page))
@@ -56,17 +45,20 @@ def server_of(state: ModelState, title: str, page: Page) -> Callable[[], bool]:
 
 
 def open_state(path: Path, device: torch.device, given: Config | None = None) -> ModelState:
-    """The model to look at, on a device, its photos in host memory.
+    """A run's newest model or a file's, on a device, its photos in host memory.
 
-    A file's model without a capture has its middle at the origin, and half of it within distance 1.
+    Args:
+        path: folder of a run, or the file of a model.
+        given: the capture of a model from a file, and how to render it; None: a run knows its own, and a file is shown
+            without one, its middle at the origin and half of it within distance 1.
 
     Raises:
         InputError: there is no usable model, or no usable capture of a run or where one was named.
     """
     if given is None and not RunFolder(path).config.is_file():
         alone, _ = read_given(path)
-        means = alone.means[alone.finite_rows()]
-        means = means if len(means) else torch.zeros(1, 3)
+        rows = alone.finite_rows()
+        means = alone.means[rows] if rows.any() else torch.zeros(1, 3)
         middle = means.median(dim=0).values
         reach = float((means - middle).norm(dim=1).median()) or 1.0
         gaussians = placed(alone, Similarity.into(Frame(middle.numpy(), reach)), path)

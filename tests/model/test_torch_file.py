@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from helpers.models import random_gaussians
+from helpers.models import OWN, random_gaussians
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.gsplat_file import read_gsplat, save_gsplat
 from turbogs_plugin.model.similarity import Similarity, placed
+from turbogs_plugin.model.torch_file import read_gsplat, save_gsplat
 from turbogs_plugin.scene import Frame
 
 
@@ -18,9 +18,8 @@ def test_what_is_written_is_what_gsplat_loads(tmp_path, sh_degree):
     save_gsplat(gaussians, tmp_path / "model.pt", frame, step=7)
     state = torch.load(tmp_path / "model.pt", weights_only=True)
     assert state["step"] == 7 and set(state) == {"step", "splats"}
-    bands = (sh_degree + 1) ** 2 - 1
     shapes = {"means": (40, 3), "quats": (40, 4), "scales": (40, 3), "opacities": (40,), "sh0": (40, 1, 3)}
-    shapes["shN"] = (40, bands, 3)
+    shapes["shN"] = (40, (sh_degree + 1) ** 2 - 1, 3)
     assert {name: tuple(value.shape) for name, value in state["splats"].items()} == shapes
     assert all(value.dtype == torch.float32 for value in state["splats"].values())
     torch.testing.assert_close(state["splats"]["means"], gaussians.means * 6 + torch.tensor([0.1, -0.2, 3.0]))
@@ -31,11 +30,10 @@ def test_what_is_written_is_what_gsplat_loads(tmp_path, sh_degree):
 
 
 def test_what_cannot_be_written_is_refused(tmp_path):
-    frame = Frame(np.zeros(3), 1.0)
     with pytest.raises(InputError, match="none of its 0 Gaussians"):
-        save_gsplat(random_gaussians(0), tmp_path / "model.pt", frame)
+        save_gsplat(random_gaussians(0), tmp_path / "model.pt", OWN)
     with pytest.raises(OSError, match="absent"):
-        save_gsplat(random_gaussians(), tmp_path / "absent" / "model.pt", frame)
+        save_gsplat(random_gaussians(), tmp_path / "absent" / "model.pt", OWN)
     assert not list(tmp_path.iterdir())
 
 
@@ -48,18 +46,13 @@ def test_what_cannot_be_written_is_refused(tmp_path):
         ({"quats": torch.zeros(39, 4)}, r"quats is float32 \(39, 4\) where gsplat has float32 \(40, 4\)"),
         ({"opacities": torch.zeros(40, dtype=torch.int64)}, r"opacities is int64 \(40,\)"),
         ({"means": torch.tensor(1.0)}, r"means is float32 \(\)"),
+        (dict(random_gaussians(0).items()), "holds 0 Gaussians"),
+        (None, "lack means"),
     ],
 )
 def test_splats_that_are_no_model(changes, words):
-    splats = {
-        name: value for name, value in {**dict(random_gaussians().items()), **changes}.items() if value is not None
-    }
+    splats = [1] if changes is None else {**dict(random_gaussians().items()), **changes}
+    if changes:
+        splats = {name: value for name, value in splats.items() if value is not None}
     with pytest.raises(InputError, match=words):
         read_gsplat({"splats": splats}, "model.pt")
-
-
-def test_no_splats_at_all():
-    with pytest.raises(InputError, match="holds 0 Gaussians"):
-        read_gsplat({"splats": dict(random_gaussians(0).items())}, "model.pt")
-    with pytest.raises(InputError, match="lack means"):
-        read_gsplat({"splats": [1]}, "model.pt")
