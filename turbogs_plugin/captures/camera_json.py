@@ -15,7 +15,7 @@ from turbogs_plugin.captures.decoding import photo_size
 from turbogs_plugin.captures.undistort import Lens, lens_of_camera
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import viewmat_of_pose
-from turbogs_plugin.yaml_json import parse_json
+from turbogs_plugin.yaml_json import parse_json, require_json_size
 
 BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 """Names of one model, whose missing coefficients are 0."""
@@ -29,6 +29,7 @@ FOR_ALL = (
 
 def read_frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """A transforms file, and its frames under a key. Raises `InputError` unless it is JSON with a list of frames."""
+    require_json_size(source)
     content = parse_json(text_of(source), str(source))
     frames = content.get(key) if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
