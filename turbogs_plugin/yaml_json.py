@@ -85,7 +85,7 @@ def read_named_yaml(name_or_file: str, package: str, kind: str) -> dict[str, Any
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file. Raises `InputError`: no such file, too large, not UTF-8, or refused by `parse_yaml`."""
+    """The mapping in a YAML file. Raises `InputError`: no such file, too large, no UTF-8, refused by `parse_yaml`."""
     try:
         with open(path, "rb") as file:
             data = file.read(SIZE_LIMIT + 1)
@@ -100,8 +100,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_yaml(text: str, where: str) -> dict[str, Any]:
-    """The mapping in a YAML text, numbers as YAML 1.2 reads them (``1e-4`` is a float). `where` is what the text is, for
-    messages: ``config 'my.yaml'``.
+    """The mapping in a YAML text, numbers as YAML 1.2 reads them (``1e-4`` is a float). `where` is what the text is,
+    for messages: ``config 'my.yaml'``.
 
     Raises:
         InputError: not YAML, not one mapping, nested too deeply; or with tags, anchors or aliases, which can run code

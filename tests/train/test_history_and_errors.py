@@ -2,16 +2,17 @@
 
 import json
 import math
-from contextlib import ExitStack
+from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
 from turbogs_plugin.train.metrics import Metrics, ViewMetrics, compare, psnr, ssim
-from turbogs_plugin.train.session import TrainingProgress
+from turbogs_plugin.train.session import REFRESH_SECONDS, TrainingProgress
 
 FIELDS = {"iteration", "train_seconds", "psnr", "ssim", "l1", "num_gaussians", "memory_bytes"}
 
@@ -84,8 +85,7 @@ def training(iteration: int, gaussians: int) -> SimpleNamespace:
 
 
 def test_progress_is_a_line_an_evaluation_where_there_is_no_terminal(capsys):
-    with ExitStack() as shown:
-        progress = TrainingProgress(shown)
+    with closing(TrainingProgress()) as progress:
         progress.advanced(training(1, 5))
         progress.evaluated(training(10, 5), evaluation(10, skipped_updates=3))
     lines = capsys.readouterr().err.splitlines()
@@ -93,13 +93,20 @@ def test_progress_is_a_line_an_evaluation_where_there_is_no_terminal(capsys):
     assert "10/100" in lines[0] and "20.10 dB" in lines[0] and "3 skipped updates" in lines[0]
 
 
-def test_progress_is_a_bar_on_a_terminal(capsys, monkeypatch):
+def test_progress_is_a_line_that_goes_on_a_terminal(capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setattr("turbogs_plugin.train.session.REFRESH_SECONDS", 0.0)
-    with ExitStack() as shown:
-        progress = TrainingProgress(shown)
+    clock = SimulatedTime(monkeypatch, tick=2.0)
+    with closing(TrainingProgress()) as progress:
         progress.evaluated(training(10, 5), evaluation(10))
         progress.advanced(training(50, 1234))
-    shown = capsys.readouterr().err
-    assert all(part in shown for part in ("50/100", "PSNR 20.10 dB", "1,234 Gaussians", "it/s"))
+        clock.tick = 0.0
+        clock.passes(REFRESH_SECONDS / 2)
+        progress.advanced(training(60, 1234))  # too soon
+        clock.passes(10.0)
+        progress.advanced(training(75, 1234))
+    shown = capsys.readouterr().err.split("\r\033[K")
+    assert "PSNR 20.10 dB" in shown[1] and shown[1].endswith("\n") and shown[-1] == ""
+    assert [line.split("  ") for line in shown[2:-1]] == [
+        ["50/100", "0 it/s", "1,234 Gaussians\r"],
+        ["75/100", "10 s left", "2 it/s", "1,234 Gaussians\r"],
+    ]

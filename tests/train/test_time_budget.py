@@ -172,9 +172,9 @@ def test_a_resumed_run_is_held_to_its_memory(stopped, monkeypatch):
     held = []
     build = Trainer.__init__
 
-    def building(trainer, *arguments):
+    def building(trainer, *arguments, **options):
         assert held == [2**31]
-        build(trainer, *arguments)
+        build(trainer, *arguments, **options)
 
     monkeypatch.setattr(run, "hold_to_limit", lambda config, device: held.append(config.budget.memory_bytes()))
     monkeypatch.setattr(Trainer, "__init__", building)

@@ -67,8 +67,7 @@ class Config:
 
     def require_decided(self) -> None:
         """Raise RuntimeError, an error of the caller's code, where a setting is left to a plan: no run can use it."""
-        left = undecided(self.to_mapping())
-        if left:
+        if left := undecided(self.to_mapping()):
             raise RuntimeError(
                 f"{', '.join(left)}: {AUTO}, but a run goes by what a plan has decided: "
                 "use make_plan(config, scene, device).apply(config), or config.without_plan()"
@@ -76,9 +75,8 @@ class Config:
 
     def without_plan(self) -> Config:
         """This configuration, decided for a run that looks at neither scene nor machine, such as a benchmark."""
-        decided = vars(TrainConfig(pixels_place="device"))  # the defaults
-        left = {name: decided[name] for name in AUTO_SETTINGS if getattr(self.train, name) == AUTO}
-        return self.changed(train=left)
+        defaults = vars(TrainConfig(pixels_place="device"))
+        return self.changed(train={name: defaults[name] for name in AUTO_SETTINGS if getattr(self.train, name) == AUTO})
 
     def changed(self, **sections: Mapping[str, Any]) -> Config:
         """This configuration with values of some sections replaced; a section with a `type` starts afresh."""
@@ -132,11 +130,8 @@ def settings_text(config: Config) -> str:
 
 
 def resolve(mapping: Mapping[str, Any], built: bool = True) -> Config:
-    """The complete, checked configuration of a mapping of sections; absent sections have their defaults.
-
-    Args:
-        built: whether strategies are built, which imports and checks them; else their sections are taken as they are.
-    """
+    """The complete, checked configuration of a mapping of sections; absent sections have their defaults. Strategies are
+    `built`, which imports and checks them; else their sections are taken as they are."""
     for section in mapping:
         if section not in SECTION_CLASSES and section not in KINDS:
             raise InputError(f"unknown section '{section}': {nearest(section, [*SECTION_CLASSES, *KINDS])}")
@@ -154,17 +149,15 @@ def resolve(mapping: Mapping[str, Any], built: bool = True) -> Config:
 def resolve_complete(
     mapping: Mapping[str, Any], where: str, decided: bool = False, built: bool = False, trusted: bool = False
 ) -> Config:
-    """`resolve` of the mapping that a run has written.
+    """`resolve` of the mapping that a run has written to the file `where`.
 
     Args:
-        where: the file, for messages.
         decided: whether nothing may be left to a plan.
         built: as for `resolve`; only a training uses strategies.
         trusted: whether code may run that nobody installed. A line on stderr names its files.
 
     Raises:
-        InputError: a part of it is missing or, where that is asked for, left to a plan; or it names code that is not
-            installed.
+        InputError: a part is missing or, unless allowed, left to a plan or code that is not installed.
     """
     foreign = foreign_code(mapping) if built else {}
     for what, file in foreign.items():

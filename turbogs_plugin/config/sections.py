@@ -219,15 +219,15 @@ class BudgetConfig:
     time: str = ""
 
     def __post_init__(self) -> None:
-        self.memory_bytes()
+        self.memory_bytes()  # which raises `InputError` where it is no amount
         require((self.seconds() or 0.0) <= LONGEST_TIME, "time", self.time, "at most 100h")
 
     def memory_bytes(self) -> int | None:
-        """`max_memory`, or None for no limit. Raises `InputError` where it is no amount."""
+        """`max_memory`, or None for no limit."""
         return parse_bytes(self.max_memory) if self.max_memory else None
 
     def seconds(self) -> float | None:
-        """`time`, or None for no limit. Raises `InputError` where it is no amount."""
+        """`time`, or None for no limit."""
         return parse_seconds(self.time) if self.time else None
 
 
@@ -236,18 +236,16 @@ def undecided(mapping: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return [f"train.{name}" for name in AUTO_SETTINGS if mapping["train"][name] == AUTO]
 
 
-BYTE_UNITS = {"": 1, "b": 1, "kib": 2**10, "mib": 2**20, "gib": 2**30, "kb": 10**3, "mb": 10**6, "gb": 10**9}
-SECOND_UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
-
-
 def parse_bytes(text: str) -> int:
     """``2GiB``, ``1500 MB``, ``300000000``. Raises `InputError`."""
-    return int(_parse(text, BYTE_UNITS, 1.0, "memory: write 2GiB, 1500MB or a number of bytes"))
+    units = {"": 1, "b": 1, "kib": 2**10, "mib": 2**20, "gib": 2**30, "kb": 10**3, "mb": 10**6, "gb": 10**9}
+    return int(_parse(text, units, 1.0, "memory: write 2GiB, 1500MB or a number of bytes"))
 
 
 def parse_seconds(text: str) -> float:
     """``20s``, ``2m``, ``1.5h``, ``20``. Raises `InputError`."""
-    return _parse(text, SECOND_UNITS, 1e-9, "time: write 20s, 2m or 1.5h")
+    units = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+    return _parse(text, units, 1e-9, "time: write 20s, 2m or 1.5h")
 
 
 def parse_color(text: str) -> Color:

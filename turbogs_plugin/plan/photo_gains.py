@@ -10,7 +10,7 @@ lines, although the nearest photo is always one of the same line.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from weakref import ReferenceType, ref
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -48,7 +48,7 @@ Floats = NDArray[np.floating]
 Integers = NDArray[np.integer]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PhotoGains:
     """Gains of V photos, in stops: factors of 2 of their values, which are gamma-coded as in the file.
 
@@ -66,42 +66,20 @@ class PhotoGains:
     rest: float
 
 
-@dataclass(frozen=True)
-class _Patches:
-    """Patches of one photo that can be compared.
-
-    Args:
-        points: [n] int64, ascending.
-        shapes: [n, 25] float32 luminance, with mean 0 and norm 1.
-        stops: [n, 3] float32, log2 of the mean colours.
-    """
+class _Patches(NamedTuple):
+    """Patches of one photo that can be compared."""
 
     points: Integers
+    """[n] int64, ascending."""
     shapes: Floats
+    """[n, 25] float32 luminance, with mean 0 and norm 1."""
     stops: Floats
-
-
-_latest: tuple[ReferenceType[PosedImages], Tensor, PhotoGains] | None = None
-"""Photos and points that were compared last, and their gains: a plan asks for them, then the training's start."""
+    """[n, 3] float32, log2 of the mean colours."""
 
 
 def compare_exposures(views: PosedImages, points: Tensor) -> PhotoGains:
-    """The gains of photos, by the surface points that they share.
-
-    Where the points are not on surfaces (random ones, for want of better), hardly a patch has a match and hardly a
-    photo is compared.
-
-    Args:
-        points: [M, 3], in the views' frame.
-    """
-    global _latest
-    if _latest is None or _latest[0]() is not views or _latest[1] is not points:
-        _latest = ref(views), points, _compared(views, points)
-    return _latest[2]
-
-
-def _compared(views: PosedImages, points: Tensor) -> PhotoGains:
-    """`compare_exposures` of photos that were not compared last."""
+    """The gains of photos, by the surface points [M, 3] that they share, in the views' frame. Where the points are not
+    on surfaces (random ones, for want of better), hardly a patch has a match and hardly a photo is compared."""
     count = len(views)
     cameras = views.cameras.to("cpu", torch.float64)
     patches = _patches(views, points)

@@ -15,15 +15,12 @@ from turbogs_plugin.yaml_json import parse_json
 
 
 class WallClock:
-    """Seconds on the wall since its making, and what they went into.
-
-    Attributes:
-        parts: name -> seconds that went into it, in the order in which they first ended.
-    """
+    """Seconds on the wall since its making, and what they went into."""
 
     def __init__(self) -> None:
         self._started = self._marked = time.perf_counter()
         self.parts: dict[str, float] = {}
+        """Name -> seconds that went into it, in the order in which they first ended."""
 
     @property
     def seconds(self) -> float:

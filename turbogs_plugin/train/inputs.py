@@ -26,12 +26,11 @@ PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
 
 def resolve_device(name: str) -> torch.device:
     """The device of ``auto``, ``cpu`` or ``cuda``. Raises `InputError` if CUDA is asked for and absent."""
-    if name == "cuda" and not torch.cuda.is_available():
-        build = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
-        raise InputError(
-            f"CUDA was asked for and is absent ({build}): see 'turbogs doctor', or begin with --device cpu"
-        )
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+    there = name != "cpu" and torch.cuda.is_available()
+    if name == "cuda" and not there:
+        why = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
+        raise InputError(f"CUDA was asked for and is absent ({why}): see 'turbogs doctor', or begin with --device cpu")
+    return torch.device("cuda" if there else "cpu")
 
 
 def require_device(name: str) -> None:
@@ -73,10 +72,9 @@ def open_started(
     config: Config, clock: WallClock, ranks: Ranks = ONE, trained: bool = False
 ) -> tuple[Scene, torch.device]:
     """The capture, and the device with its kernels loaded: a thread starts it, in a second or more, while photos are
-    decoded.
+    decoded. Both are marked on the clock of the wall.
 
     Args:
-        clock: of the wall, on which `PHOTOS` and `DEVICE` are marked.
         ranks, trained: as for `open_scene`. Where one process ends before, the others wait until their launcher
             ends them.
 

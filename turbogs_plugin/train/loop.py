@@ -38,7 +38,6 @@ class TrainingLoop:
     """Trains from mark to mark of a pace, and measures the time.
 
     Args:
-        trainer: new, or with a state loaded.
         pace: where to stop on the way, and where to end; None: after the configured iterations.
         listeners: called in this order.
         seconds: training time that passed before.
@@ -61,14 +60,8 @@ class TrainingLoop:
         self.stopped = False
 
     def run(self, resumed: bool = False) -> None:
-        """Train to the end, or until `stop`.
-
-        Args:
-            resumed: the trainer's state was loaded, so its error maps are there.
-
-        Raises:
-            TrainingStopped: the model is lost, another process ended, or devices hold different models.
-        """
+        """Train to the end, or until `stop`. Where the run is resumed, its error maps are there. Raises
+        `TrainingStopped` where the model is lost, another process ended, or devices hold different models."""
         trainer, pace, clock = self.trainer, self.pace, self.clock
         if not resumed:
             with clock:
@@ -105,11 +98,7 @@ class TrainingLoop:
         self.clock.seconds = self.ranks.agree(self.clock.seconds)
 
     def stop(self, signal: int = SIGTERM) -> None:
-        """Stop after the present iteration; where several processes train, as soon as all know of it.
-
-        Args:
-            signal: number of the one that asks for it.
-        """
+        """Stop after the present iteration, or as soon as all processes know of it; a signal's number asks for it."""
         if not self.ranks.ask_to_stop(signal):
             self.stopped = True
 
