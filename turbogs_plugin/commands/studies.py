@@ -43,8 +43,8 @@ def ablate(
 
     if not scene:
         raise InputError("ablate needs --scene SCENE: the folder of a capture")
-    for option, count in (("--steps", steps), ("--gpus", gpus)):
-        require_positive(option, () if count is None else (count,))
+    require_positive("--steps", steps)
+    require_positive("--gpus", gpus)
     choice = CellChoice(scene, seeds, only, overrides, steps, device)
     failures = run_study(load_ablation(name), choice, out, gpus)
     for failure in failures:
@@ -71,7 +71,7 @@ def report(
     from turbogs_plugin.study.runs import study_of_runs
     from turbogs_plugin.study.study_report import write_report
 
-    require_positive("--psnr", psnr)
+    require_positive("--psnr", *psnr)
     if not paths:
         raise InputError("report needs STUDY ..., folders of studies, or RUN RUN ... --out NEW, folders of runs")
     folders = [StudyFolder(path) for path in paths]

@@ -14,29 +14,23 @@ what a reset of opacities takes away grows back at the rate of the optimizer, ho
 
 SHORTEST_INTERVAL = 10
 """Shortest interval of density control that scaling makes: its statistics need a window of some iterations."""
-
 REGROWTH = 50
 """Iterations in which opacities grow back what an event of density control takes; an event that comes sooner takes
 less."""
-
 BATCH_FIELDS = ("min_views", "max_views", "views", "pixel_budget")
 """Settings of a schedule that grow with the batch."""
-
 RATE_EXPONENT = 0.5
 """Learning rates grow with this power of the batch. Where a gradient is mostly noise, Adam's step has the length of its
 rate whatever the batch, and n small steps go as far as one that is sqrt(n) times as long (Malladi et al. 2022; for
 Gaussians: Grendel, Zhao et al. 2024)."""
-
 MOMENT_FIELDS = ("beta1", "beta2")
 """Decays of an optimizer's moments, raised to the power of the batch: moments then forget after a number of samples,
 not of iterations (Grendel). Measured by `configs/ablations/batch.yaml`."""
 
 
 def with_iterations(config: Config, iterations: int) -> Config:
-    """The configuration for a run of exactly this length, with everything scaled that counts iterations.
-
-    Intervals of density control stay at `SHORTEST_INTERVAL` or above; 0 stays 0.
-    """
+    """The configuration for a run of exactly this length, with everything scaled that counts iterations. Intervals of
+    density control stay at `SHORTEST_INTERVAL` or above; 0 stays 0."""
     mapping, factor = config.to_mapping(), iterations / config.train.written_iterations
     density = mapping["density"]
     interval = density.get("refine_every", REGROWTH)
@@ -54,11 +48,8 @@ def with_iterations(config: Config, iterations: int) -> Config:
 
 
 def with_batch_for(config: Config, processes: int) -> Config:
-    """The configuration for `processes` that train together, from one whose batch is written for one process.
-
-    Views and pixels of an iteration are multiplied by the number of processes, learning rates by its root; moments
-    forget after an unchanged number of samples.
-    """
+    """The configuration for `processes` that train together, from one whose batch is written for one process: views and
+    pixels of an iteration grow by their number, learning rates by its root."""
     mapping = config.to_mapping()
     schedule, optimizer = mapping["schedule"], mapping["optimizer"]
     for name in set(BATCH_FIELDS) & set(schedule):

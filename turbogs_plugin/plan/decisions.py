@@ -162,16 +162,18 @@ def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
 def wanted_pixels_place(facts: SceneFacts, config: Config) -> Verdict:
     """Photos and maps on the device where they fit into a share of its memory; of a pixel, 3 bytes of photos and 4 of
     maps travel to the device each iteration otherwise, and 4 back."""
-    room = HOST_SHARE * facts.host_bytes
-    in_file = f"{HOST_SHARE:.0%} of {mebibytes(facts.host_bytes)} free on the host: maps in a file"
+    in_file = ""
+    if facts.map_bytes > HOST_SHARE * facts.host_bytes:
+        in_file = f" > {HOST_SHARE:.0%} of {mebibytes(facts.host_bytes)} free on the host: maps in a file"
     if facts.device == "cpu":
-        if facts.map_bytes > room:
-            return "host", f"{mebibytes(facts.map_bytes)} > {in_file}"
+        if in_file:
+            return "host", mebibytes(facts.map_bytes) + in_file
         return "device", "the device is the CPU, whose memory is the host's"
     size = facts.photo_bytes + facts.map_bytes
-    fits = size <= DEVICE_SHARE * facts.device_bytes
-    reason = f"{mebibytes(size)} {'<=' if fits else '>'} {DEVICE_SHARE:.0%} of {mebibytes(facts.device_bytes)}"
-    return "device" if fits else "host", f"{reason}, > {in_file}" if not fits and facts.map_bytes > room else reason
+    share = f"{DEVICE_SHARE:.0%} of {mebibytes(facts.device_bytes)}"
+    if size <= DEVICE_SHARE * facts.device_bytes:
+        return "device", f"{mebibytes(size)} <= {share}"
+    return "host", f"{mebibytes(size)} > {share}" + (f",{in_file}" if in_file else "")
 
 
 def mebibytes(size: int) -> str:

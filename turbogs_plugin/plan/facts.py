@@ -19,16 +19,14 @@ class SceneFacts:
     """Numbers that the plan knows.
 
     Args:
-        train_views: number of training views.
         direction_concentration: norm of the mean unit viewing direction of the training cameras; 1: all look the same
             way, 0: all around.
         photo_bytes: of all photos, training and test.
         map_bytes: of the training views' error and age maps.
-        device: cpu or cuda.
         device_bytes, host_bytes: memory free for this run, on the device at most `budget.max_memory`; on a CPU both are
             the same memory.
         transparent: training photos have an alpha.
-        processes: that will train one model together.
+        processes: number of those that will train one model together.
         gains: how far training photos differ in brightness and white balance; None where no setting asks for it.
         reprojection_error: a median in pixels, see `Scene`; None: not known.
     """

@@ -30,16 +30,9 @@ _NAME = re.compile(r"iteration-(\d{6,})\.pt")
 
 
 def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path:
-    """Write the state of a run, after this number of finished iterations, and make it the newest one.
-
-    Args:
-        folder: ``checkpoints/`` of the run; made if absent.
-        state: nested dicts, lists and tuples of tensors, numbers, text, booleans and None.
-
-    Raises:
-        TrainingStopped: the disk refused; the newest checkpoint is the one before.
-        TypeError: something in `state` is not plain.
-    """
+    """Write the state of a run, nested dicts, lists and tuples of tensors and plain values, after this number of
+    iterations, into its folder ``checkpoints/``, and make it the newest one. Raises `TrainingStopped` where the disk
+    refused, and the checkpoint before stays the newest; `TypeError` where something is not plain."""
     for place, value in leaves(state, "state"):
         if type(value) not in (Tensor, int, float, bool, str, type(None)):
             raise TypeError(f"{place}: a checkpoint holds tensors and plain values, not {type(value).__name__}")

@@ -20,8 +20,8 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.agreement import require_agreement, unseeing_note
 from turbogs_plugin.train.clock import WallClock
 
-PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
-"""Parts of the wall time in which photos are decoded, and the device is then waited for."""
+DEVICE = "CUDA and kernels, after the photos"
+"""The part of the wall time in which the device is waited for."""
 
 
 def resolve_device(name: str) -> torch.device:
@@ -72,15 +72,8 @@ def open_started(
     config: Config, clock: WallClock, ranks: Ranks = ONE, trained: bool = False
 ) -> tuple[Scene, torch.device]:
     """The capture, and the device with its kernels loaded: a thread starts it, in a second or more, while photos are
-    decoded. Both are marked on the clock of the wall.
-
-    Args:
-        ranks, trained: as for `open_scene`. Where one process ends before, the others wait until their launcher
-            ends them.
-
-    Raises:
-        InputError: there is no usable capture, or no such device.
-    """
+    decoded. Both are marked on the clock of the wall. Arguments and errors as of `open_scene`. Where one process ends
+    before, the others wait until their launcher ends them."""
 
     def start() -> torch.device:
         device = resolve_device(config.train.device)
@@ -93,7 +86,7 @@ def open_started(
     with ThreadPoolExecutor(1) as pool:
         started = pool.submit(start)
         scene = open_scene(config.scene, config.train.refine_cameras, ranks, trained)
-        clock.mark(PHOTOS)
+        clock.mark("photos")
         device = started.result()
     clock.mark(DEVICE)
     return scene, device

@@ -40,7 +40,6 @@ class TrainingLoop:
     Args:
         pace: where to stop on the way, and where to end; None: after the configured iterations.
         listeners: called in this order.
-        seconds: training time that passed before.
         ranks: the processes that train the model; each has such a loop, and the first one's clock counts.
     """
 
@@ -56,8 +55,7 @@ class TrainingLoop:
         self.pace = pace or Pace(trainer.config.train)
         self.listeners = list(listeners)
         self.clock = TrainingClock(trainer.device, seconds)
-        self.ranks = ranks
-        self.stopped = False
+        self.ranks, self.stopped = ranks, False
 
     def run(self, resumed: bool = False) -> None:
         """Train to the end, or until `stop`. Where the run is resumed, its error maps are there. Raises
@@ -108,8 +106,7 @@ class TrainingLoop:
         return self.trainer.iteration >= self.pace.iterations
 
     def _is_short_of(self, mark: int) -> bool:
-        """Whether to go on towards a mark. At a mark or a stop it waits for the GPU and subtracts lost iterations, so
-        that none is missing there."""
+        """Whether to go on towards a mark. At a mark or a stop it waits for the GPU, and no iteration is missing."""
         if self.trainer.iteration >= mark or self.stopped:
             self.trainer.repeat_lost(wait=True)
         return self.trainer.iteration < mark and not self.stopped

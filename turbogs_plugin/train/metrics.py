@@ -124,12 +124,8 @@ def psnr(image: Tensor, photo: Tensor) -> float:
 
 
 def compare(name: str, image: Tensor, photo: Tensor, mask: Tensor | None = None) -> ViewMetrics:
-    """Errors of an image against a photo, both [H, W, 3] float, 0 .. 1. SSIM has its usual Gaussian window of 11.
-
-    Args:
-        mask: [H, W] bool, the pixels to compare, at least one; None: all. SSIM's is the mean over their windows, in
-            which masked pixels are the photo's in both images.
-    """
+    """Errors of an image against a photo, both [H, W, 3] float, 0 .. 1, at the one or more pixels of a mask [H, W],
+    or all. SSIM is the mean over their windows, in which masked pixels are the photo's in both images."""
     enough = min(image.shape[:2]) >= SSIM_SIDE
     similarity = ssim(_unmasked(image, photo, mask), photo, mask).item() if enough else math.nan
     if mask is not None:
@@ -143,12 +139,8 @@ def _unmasked(image: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def ssim(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Structural similarity, the mean over all pixels and channels; borders are mirrored, as torchmetrics does.
-
-    Args:
-        image, photo: [H, W, 3] float, 0 .. 1, with sides of at least `SSIM_SIDE`.
-        mask: [H, W] bool, the pixels to take the mean over; None: all.
-    """
+    """Structural similarity of images [H, W, 3] float, 0 .. 1, with sides of at least `SSIM_SIDE`: a scalar, the mean
+    over channels and the pixels of a mask [H, W], or all; borders are mirrored, as torchmetrics does."""
     x, y = (picture.permute(2, 0, 1) for picture in (image, photo))  # [3, H, W]
     mean_x, mean_y, xx, yy, xy = _blurred(torch.stack((x, y, x * x, y * y, x * y)))
     variances = (xx - mean_x.square()).clamp(min=0.0) + (yy - mean_y.square()).clamp(min=0.0)
@@ -195,7 +187,7 @@ class Evaluations(Listener):
         trainer = loop.trainer
         trainer.require_finite()
         metrics = evaluate(trainer.gaussians, self.test, trainer.look(self.test.names), refined=loop.finished)
-        mean = metrics.mean
+        mean, self.metrics = metrics.mean, metrics
         evaluation = Evaluation(
             iteration=trainer.iteration,
             train_seconds=loop.clock.seconds,
@@ -207,7 +199,6 @@ class Evaluations(Listener):
             **{measure: getattr(mean, measure) for measure in MEASURES},
             **mean.further(),
         )
-        self.metrics = metrics
         self.history.append(evaluation)
         for listener in loop.listeners:
             listener.evaluated(loop, evaluation)

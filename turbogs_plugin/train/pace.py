@@ -1,7 +1,7 @@
 """The clock of training, and the pace of a run: how far it goes and where it stops, by iterations or by time.
 
 A time budget makes the run as long as ``seconds left / seconds of an iteration``: before it by a few iterations that
-are timed and thrown away, then again and again while it trains.
+are timed and thrown away, then at each look at the clock.
 """
 
 from __future__ import annotations
@@ -33,15 +33,11 @@ TRIAL_ITERATIONS = {"cuda": 20, "cpu": 2}
 
 
 class TrainingClock:
-    """Seconds of training. Use it as a context around training alone; it waits for the GPU at both ends.
-
-    Args:
-        seconds: training time that passed before.
-    """
+    """Seconds of training, from those that passed before. Use it as a context around training alone; it waits for the
+    GPU at both ends."""
 
     def __init__(self, device: torch.device, seconds: float = 0.0) -> None:
-        self.device = device
-        self.seconds = seconds
+        self.device, self.seconds = device, seconds
 
     def __enter__(self) -> TrainingClock:
         synchronize(self.device)
@@ -67,15 +63,11 @@ class Pace:
     """A fixed number of iterations, or as many as fit into a time.
 
     With a time, everything that depends on progress (learning rates, sampling, density control, evaluations) ends with
-    it: T and the end of density control follow the seconds of an iteration.
+    it: T (`iterations`) and the end of density control (`refine_until`) follow the seconds of an iteration.
 
     Args:
         train: settings of the run. With a time, its iterations and its end of density control are the first guess.
         budget: seconds when to end, on the clock of training; None: after the configured iterations.
-
-    Attributes:
-        iterations: T, as known now.
-        refine_until: last iteration of density control, as known now.
     """
 
     def __init__(self, train: TrainConfig, budget: float | None = None) -> None:
