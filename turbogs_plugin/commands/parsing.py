@@ -80,7 +80,7 @@ def _unknown_option(function: Command, words: Sequence[str]) -> str:
             known |= {entry.name for entry in fields(parameter.default)}
         elif parameter.kind is Parameter.KEYWORD_ONLY:
             known |= {name, f"no_{name}"} if isinstance(parameter.default, bool) else {name}
-    for word, behind in zip(words, (*words[1:], ""), strict=True):
+    for word, behind in zip(words, (*words[1:], ""), strict=False):
         option, equals, value = word.partition("=")
         name = option[2:].replace("-", "_")
         if not option.startswith("--") or name in known:
