@@ -29,9 +29,8 @@ def bench(
     Step and raster need a model of the scene, too: turbogs train SCENE --out RUN writes RUN/model.ply.
 
     Args:
-        what: step: an iteration from sampling to update, step by step beside what memory and arithmetic allow. raster:
-            forward and backward pass stage by stage, beside gsplat's dense ones. wall: the command itself by the clock
-            on the wall, part by part.
+        what: step: an iteration, step by step beside what memory and arithmetic allow. raster: both passes, stage by
+            stage beside gsplat's dense ones. wall: the command itself by the clock on the wall, part by part.
         overrides: changes of the configuration that is timed, e.g. scene.factor=2.
         scene: folder of the capture.
         ply: step, raster: the trained model to time, so that several builds time the same.

@@ -77,22 +77,18 @@ def render(
         seconds: of the film; 10 where absent.
         device: where to render.
     """
-    if path is not None:
-        from turbogs_plugin.export.renders import film_run
+    from turbogs_plugin.export.renders import film_run, render_run
 
+    settings = given.settings(overrides)
+    if path is None:
+        if seconds is not None:
+            raise InputError("--seconds is the length of a film: give --path and --out FILE.mp4, too")
+        folders = render_run(run, split, device, depth, settings, out)
+        print("\n".join(f"{name:<8} {folder}" for name, folder in zip(("renders", "depths"), folders, strict=False)))
+    else:
         if depth or split != "test" or out is None:
             raise InputError("--path writes a film: it takes --out FILE.mp4 and --seconds, not --split or --depth")
-        film = film_run(run, path, out, 10.0 if seconds is None else seconds, device, given.settings(overrides))
-        print(f"film   {film}")
-        return 0
-    if seconds is not None:
-        raise InputError("--seconds is the length of a film: give --path and --out FILE.mp4, too")
-
-    from turbogs_plugin.export.renders import render_run
-
-    folders = render_run(run, split, device, depth, given.settings(overrides), out)
-    for name, folder in zip(("renders", "depths"), folders, strict=False):
-        print(f"{name:<8} {folder}")
+        print(f"film   {film_run(run, path, out, 10.0 if seconds is None else seconds, device, settings)}")
     return 0
 
 

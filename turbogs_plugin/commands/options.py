@@ -19,7 +19,6 @@ LOCAL, PORT = "127.0.0.1", 8080
 """Where a viewer listens unless told otherwise: for this machine alone."""
 
 Device = Literal["auto", "cpu", "cuda"]
-
 Overrides = Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")]
 Count = Annotated[int | None, arg(metavar="N")]
 Scene = Annotated[Path | None, arg(metavar="SCENE")]

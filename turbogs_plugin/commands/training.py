@@ -46,8 +46,7 @@ def train(
         out: new folder for the run.
         resume: folder of a stopped run to go on with, by its own configuration.
         report: at the end, write the report and its pictures; --no-report leaves model, history and checkpoints.
-        viewer: show the training in a browser, at this port (8080 where none is named); afterwards its model, until
-            Ctrl-C.
+        viewer: show the training in a browser, at this port (or 8080); afterwards its model, until Ctrl-C.
         viewer_host: address where the viewer listens; 0.0.0.0 lets others on the network look, and pause the training.
         gpus: number of this machine's GPUs that train one model, a process each; torchrun does the same on several
             machines. docs/scaling.md says what they gain.
