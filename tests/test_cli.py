@@ -66,7 +66,7 @@ def test_photos_of_more_pixels_than_pillow_takes_for_harmless(turbogs, capture, 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--max-gaussians", "0"], ["--max-gaussians 0", "at least 1"]),
+        (["--max-gaussians", "0"], ["--max-gaussians 0: it must be above 0"]),
         (["--config", "turbo"], ["'turbo'", "turbogs-big", "did you mean 'turbogs'"]),
         (["schedule.min_views=9", "schedule.max_views=4"], ["max_views", "9", "4"]),
         (["--factor", "0"], ["factor = 0 is not valid: it must be at least 1"]),

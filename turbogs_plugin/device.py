@@ -42,14 +42,9 @@ def free_bytes(device: torch.device) -> int:
     return torch.cuda.mem_get_info(device)[0] + unused
 
 
-def memory_bytes(device: torch.device) -> int:
-    """Memory of the tensors on a GPU now, without what processes share (`distributed.peer_memory`); on a CPU, the peak
-    of this process. Does not wait for the GPU."""
-    return torch.cuda.memory_allocated(device) if device.type == "cuda" else peak_memory_bytes(device)
-
-
 def peak_memory_bytes(device: torch.device) -> int:
-    """Peak of the tensors' memory on a GPU, as `memory_bytes` counts it, or of this process on a CPU."""
+    """Peak of the tensors' memory on a GPU, without what processes share (`distributed.peer_memory`), or of this
+    process on a CPU."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     import resource  # not on Windows

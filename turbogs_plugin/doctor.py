@@ -15,38 +15,30 @@ from turbogs_plugin.report.evaluation import LPIPS_PACKAGES
 from turbogs_plugin.report.provenance import hardware, missing_bytecode, software
 from turbogs_plugin.viewer.server import INSTALL as INSTALL_VIEWER
 
-REQUIREMENTS = (
-    "pycolmap>=4.0",
-    "filelock>=3.12",
-    "scipy>=1.10",
-    "trimesh>=4.0",
-    "tyro>=1.0.17,<1.1",
-    "rich>=13.0",
-    "matplotlib>=3.8",
-)
+REQUIREMENTS = "pycolmap>=4.0 filelock>=3.12 scipy>=1.10 trimesh>=4.0 tyro>=1.0.17,<1.1 rich>=13.0 matplotlib>=3.8"
 """The extra ``train`` of pyproject.toml. The strategies and the gsplat bridge need none of it."""
-COMMAND_PACKAGES = {requirement.partition(">=")[0]: requirement for requirement in REQUIREMENTS}
+COMMAND_PACKAGES = {requirement.partition(">=")[0]: requirement for requirement in REQUIREMENTS.split()}
 """Module -> requirement."""
-
-INSTALL_COMMANDS = f"pip install {shlex.join(REQUIREMENTS)}"
+INSTALL_COMMANDS = f"pip install {shlex.join(REQUIREMENTS.split())}"
 
 
 def diagnosis() -> str:
     """Versions, devices, kernels and what is missing, for a person to read."""
-    reason = library.unavailable_reason()
-    missing = [f"kernels: {reason}"] if reason else []
-    usable = (
-        "not usable" if reason else f"loaded from {library.library_path()}, for {', '.join(library.architectures())}"
-    )
+    missing, usable = [], "not usable"
+    if reason := library.unavailable_reason():
+        missing.append(f"kernels: {reason}")
+    else:
+        usable = f"loaded from {library.library_path()}, for {', '.join(library.architectures())}"
+    on_gpu = torch.cuda.is_available()
     lines = [f"{name:<16}{version}" for name, version in software()]
-    lines += [f"{'machine':<16}{hardware('cuda' if torch.cuda.is_available() else 'cpu')}"]
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    lines += [f"{'machine':<16}{hardware('cuda' if on_gpu else 'cpu')}"]
+    count = torch.cuda.device_count() if on_gpu else 0
     for index, gpu in enumerate(map(torch.cuda.get_device_properties, range(count))):
         lines.append(f"{'GPU':<16}{index}: {gpu.name}, sm_{gpu.major}{gpu.minor}, {gpu.total_memory / 2**30:.0f} GiB")
     lines += [f"{'nvcc':<16}{shutil.which('nvcc') or 'not found'}", f"{'kernels':<16}{usable}"]
     if torch.version.cuda is None:
         missing.append("CUDA in PyTorch: training runs on the CPU, by the torch reference")
-    elif not torch.cuda.is_available():
+    elif not on_gpu:
         missing.append("a GPU that answers: training runs on the CPU, by the torch reference")
     if reason := missing_bytecode():
         missing.append(reason)

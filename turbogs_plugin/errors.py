@@ -15,18 +15,12 @@ LONGEST_LINE = 1200
 
 
 class InputError(ValueError):
-    """Bad input: one line that names the thing and the remedy.
-
-    The command line prints it on stderr without a traceback and exits with code 2.
-    """
+    """Bad input: one line that names the thing and the remedy. The command line exits with code 2."""
 
 
 class TrainingStopped(RuntimeError):
-    """A run that cannot go on: one line that says at which iteration and why.
-
-    Files that the run saved before stay as they are. The command line prints the line without a traceback and exits
-    with code 1.
-    """
+    """A run that cannot go on: one line that says at which iteration and why. Files that the run saved before stay. The
+    command line exits with code 1."""
 
 
 def require(valid: bool, field: str, value: object, allowed: str) -> None:
@@ -45,21 +39,19 @@ def require_not_negative(instance: object, *fields: str) -> None:
 def nearest(name: object, known: Iterable[str]) -> str:
     """A hint for an unknown name: the nearest known one, where one is near, and all of them."""
     known = sorted(known)
-    close = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
-    all_known = ", ".join(known) or "none"
-    return f"did you mean '{close[0]}'? (known: {all_known})" if close else f"known are {all_known}"
+    close, names = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5), ", ".join(known) or "none"
+    return f"did you mean '{close[0]}'? (known: {names})" if close else f"known are {names}"
 
 
 def refusal(error: OSError) -> str:
     """Reason for which the system refused a file, and the remedy."""
+    remedy = "choose another place"
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        remedy = "choose another place or make room"
+        remedy += " or make room"
     elif isinstance(error, PermissionError):
-        remedy = "choose another place or give yourself leave to use it (chmod)"
+        remedy += " or give yourself leave to use it (chmod)"
     elif isinstance(error, FileNotFoundError):
-        remedy = "see that its folder is there, or choose another place"
-    else:
-        remedy = "choose another place"
+        remedy = f"see that its folder is there, or {remedy}"
     return f"{error.strerror or ' '.join(map(str, error.args))}; {remedy}"
 
 

@@ -1,5 +1,4 @@
-"""Reading text, and writing files so that a reader sees the old one or the new one, and never a part; which of the
-processes that write them still run."""
+"""Reading text, and writing files so that a reader sees the old one or the new one, and never a part."""
 
 from __future__ import annotations
 
@@ -17,21 +16,15 @@ from pathlib import Path
 from typing import BinaryIO
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.yaml_json import JSON_LIMIT
+from turbogs_plugin.yaml_json import require_json_size
 
 PAUSE = 0.02
 """Seconds between two times that a large file is brought to the disk while it is written."""
 
 
 def require_writable(folder: Path, given: str) -> None:
-    """Try to make an entry in a folder, or in the nearest one above it that is there; nothing stays behind.
-
-    Args:
-        given: what names the place, for the message.
-
-    Raises:
-        InputError: the folder takes no new entries.
-    """
+    """Raise `InputError` where a folder, or the nearest one above it that is there, takes no new entries. `given` is
+    what names the place, for the message. Nothing stays behind."""
     place = folder.absolute()
     while not os.path.lexists(place):
         place = place.parent
@@ -56,16 +49,13 @@ def read_text(path: Path) -> str | None:
     than `JSON_LIMIT`."""
     if path.exists() and not path.is_file():
         raise InputError(f"cannot read '{path}': it is no file")
+    require_json_size(path)
     try:
-        with open(path, "rb") as file:
-            text = file.read(JSON_LIMIT + 1).decode("utf-8")
+        return path.read_bytes().decode("utf-8")
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read '{path}': {error}; write or copy it again") from None
-    if len(text) > JSON_LIMIT:
-        raise InputError(f"cannot read '{path}': it has more than {JSON_LIMIT >> 20} MiB")
-    return text
 
 
 @contextmanager
@@ -97,8 +87,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object], large: boo
     """
     prefix = f".{path.name}.{socket.gethostname()}."  # of the partial files that this host writes
     for leftover in path.parent.glob(f"{glob.escape(prefix)}*.part"):
-        writer = leftover.name.removeprefix(prefix).partition(".")[0]
-        if not writer.isdecimal() or process_started(int(writer)) == "gone":
+        if not _runs(leftover.name.removeprefix(prefix).partition(".")[0]):
             leftover.unlink(missing_ok=True)
     temporary = path.with_name(f"{prefix}{os.getpid()}.{secrets.token_hex(8)}.part")
     try:
@@ -112,7 +101,22 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object], large: boo
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    _sync_folder(path.parent)
+    descriptor = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)  # brings the rename itself to the disk
+    finally:
+        os.close(descriptor)
+
+
+def _runs(process: str) -> bool:
+    """Whether a process of this host has this number."""
+    try:
+        os.kill(int(process), 0)
+    except (ValueError, OverflowError, ProcessLookupError):
+        return False
+    except OSError:  # of another user
+        pass
+    return True
 
 
 def new_file(path: Path) -> BinaryIO:
@@ -148,30 +152,3 @@ def unused_name(name: str, taken: Container[str]) -> str:
 def write_text_atomically(path: Path, text: str) -> None:
     """`write_atomically` for UTF-8 text."""
     write_atomically(path, lambda file: file.write(text.encode("utf-8")))
-
-
-def _sync_folder(folder: Path) -> None:
-    """Bring the rename itself to the disk, where the platform can."""
-    if not hasattr(os, "O_DIRECTORY"):
-        return
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def process_started(process: int) -> str:
-    """Start time of a process of this host, which tells it from a later process of its number; "gone" where there is
-    none, "" where nothing is known."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text(errors="replace").rpartition(")")[2].split()[19]
-    except (OSError, IndexError):
-        pass
-    try:  # a system without /proc
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return "gone"
-    except OSError:
-        pass
-    return ""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from contextlib import suppress
 from copy import deepcopy
 from functools import lru_cache
 from importlib import resources
@@ -18,18 +19,13 @@ import yaml
 
 from turbogs_plugin.errors import InputError, nearest
 
-SIZE_LIMIT = 64 * 1024
-"""Bytes of a configuration file. The packaged ones have about three thousand."""
-
-DEPTH_LIMIT = 16
-"""Levels of nesting, well above what any configuration has."""
-
+SIZE_LIMIT, DEPTH_LIMIT = 64 * 1024, 16
+"""Bytes of a configuration file, of which the packaged ones have about three thousand, and levels of its nesting."""
 JSON_LIMIT = 64 * 2**20
-"""Characters of a JSON text. A photo of a transforms.json takes about one thousand."""
-
+"""Bytes of a JSON file, and letters of a JSON text. A photo of a transforms.json takes about one thousand."""
 FLOAT = re.compile(
-    r"""[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?  # 0.25, 1e-4, .5
-    |[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)""",
+    r"""(?:[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?  # 0.25, 1e-4, .5
+    |[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$""",
     re.VERBOSE,
 )
 """A number of YAML 1.2. PyYAML's own rule, of YAML 1.1, takes 1e-4 for text."""
@@ -63,9 +59,8 @@ class _Dumper(yaml.SafeDumper):
     """PyYAML's safe dumper, with quotes around text that `_Loader` would take for a number."""
 
 
-_FLOAT = re.compile(f"(?:{FLOAT.pattern})$", re.VERBOSE)
 for _kind in (_Loader, _Dumper):
-    _kind.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, [*"-+.0123456789"])
+    _kind.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, [*"-+.0123456789"])
 
 
 def packaged_names(package: str) -> list[str]:
@@ -77,11 +72,7 @@ def packaged_names(package: str) -> list[str]:
 def read_named_yaml(name_or_file: str, package: str, kind: str) -> dict[str, Any]:
     """The mapping in a packaged YAML file, or in one on the disk.
 
-    Args:
-        kind: what such files are, for messages.
-
-    Raises:
-        InputError: an unknown name, or an unreadable file.
+    `kind` is what such files are, for messages. Raises `InputError` for an unknown name, or an unreadable file.
     """
     known = packaged_names(package)
     if name_or_file in known:
@@ -94,11 +85,7 @@ def read_named_yaml(name_or_file: str, package: str, kind: str) -> dict[str, Any
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file.
-
-    Raises:
-        InputError: no such file, too large, not UTF-8, or refused by `parse_yaml`.
-    """
+    """The mapping in a YAML file. Raises `InputError`: no such file, too large, no UTF-8, refused by `parse_yaml`."""
     try:
         with open(path, "rb") as file:
             data = file.read(SIZE_LIMIT + 1)
@@ -113,15 +100,12 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_yaml(text: str, where: str) -> dict[str, Any]:
-    """The mapping in a YAML text, numbers as YAML 1.2 reads them (``1e-4`` is a float).
-
-    Tags, anchors and aliases are refused before anything is built: they can run code or grow without bound.
-
-    Args:
-        where: what the text is, for messages: ``config 'my.yaml'``.
+    """The mapping in a YAML text, numbers as YAML 1.2 reads them (``1e-4`` is a float). `where` is what the text is,
+    for messages: ``config 'my.yaml'``.
 
     Raises:
-        InputError: not YAML, not one mapping, nested too deeply, or with tags, anchors or aliases.
+        InputError: not YAML, not one mapping, nested too deeply; or with tags, anchors or aliases, which can run code
+            or grow without bound and are refused before anything is built.
     """
     return deepcopy(_parsed(text, where))
 
@@ -165,6 +149,17 @@ def yaml_text(mapping: dict[str, Any]) -> str:
     return yaml.dump(mapping, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
+def require_json_size(path: Path) -> None:
+    """Raise `InputError` where a file is longer than `JSON_LIMIT`, before it is read."""
+    with suppress(OSError):  # whoever reads it says why that cannot be
+        _require_length(path.stat().st_size, str(path))
+
+
+def _require_length(length: int, where: str) -> None:
+    if length > JSON_LIMIT:
+        raise InputError(f"{where} has more than {JSON_LIMIT >> 20} MiB: take out what is not needed")
+
+
 def _whole(digits: str) -> int | float:
     """A number without a point; a float where it has more digits than 63 bits. `ValueError`: no float has as many."""
     if not math.isfinite(number := float(digits)):
@@ -173,16 +168,9 @@ def _whole(digits: str) -> int | float:
 
 
 def parse_json(text: str, where: str) -> Any:
-    """The value in a JSON text.
-
-    Args:
-        where: what the text is, for messages: ``'transforms.json'``.
-
-    Raises:
-        InputError: longer than `JSON_LIMIT`, not JSON, or nested more deeply than Python's parser follows.
-    """
-    if len(text) > JSON_LIMIT:
-        raise InputError(f"{where} has more than {JSON_LIMIT >> 20} MiB: take out what is not needed")
+    """The value in a JSON text. Raises `InputError`: longer than `JSON_LIMIT`, not JSON, or nested more deeply than
+    Python's parser follows. `where` is what the text is, for messages: ``'transforms.json'``."""
+    _require_length(len(text), where)
     try:
         return json.loads(text, parse_int=_whole)
     except (ValueError, RecursionError) as error:

@@ -114,7 +114,7 @@ def test_bench_raster_says_what_it_measured_on(turbogs, capture, ply, tmp_path):
 @pytest.mark.parametrize(
     ("call", "word"),
     [
-        ("step --ply PLY", "--scene SCENE"),
+        ("step --ply PLY", "it needs --scene"),
         ("step --scene CAPTURE", "--ply MODEL.ply"),
         ("wall --scene CAPTURE --ply PLY", "leave --ply out"),
         ("step --scene CAPTURE --ply absent.ply", "absent.ply"),

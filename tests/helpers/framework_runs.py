@@ -10,9 +10,10 @@ from tempfile import TemporaryDirectory
 import pytest
 import torch
 
-from turbogs_plugin.captures import write_demo_capture
+from turbogs_plugin.captures import load_scene, write_demo_capture
 from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.config.configuration import Config, load_config
+from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.trainer import Trainer
 
 TINY = (
@@ -70,11 +71,17 @@ def thin_out_points(capture: Path, every: int) -> Path:
     return capture
 
 
-def tiny_config(capture: Path, *overrides: str) -> Config:
+def tiny_config(capture: Path | str, *overrides: str) -> Config:
     """14 iterations with three densifications, two final prunings and three SH degrees."""
     config = load_config("turbogs", [*TINY, "train.device=cpu", *overrides])
     config.scene.path = str(capture)
     return config
+
+
+def tiny_trainer(scene: Scene | Path, *overrides: str) -> Trainer:
+    """A trainer on the CPU, on a scene or a capture, whose first maps are not there yet."""
+    scene = scene if isinstance(scene, Scene) else load_scene(scene)
+    return Trainer(tiny_config("capture", *overrides).without_plan(), scene, torch.device("cpu"))
 
 
 def interrupt(trainer: Trainer) -> None:

@@ -70,5 +70,5 @@ def test_concentration_of_view_directions(tilt):
 @pytest.mark.parametrize("views", [1, 4])
 def test_points_that_no_camera_sees_and_a_single_view_decide_nothing(points, views):
     train = posed([noise(seed=number) for number in range(views)], nadir(LINE[:views]))
-    facts = gather_facts(scene_of(train, np.reshape(points, (-1, 3))), CPU, with_exposures=True)
-    assert (facts.exposure_views, facts.exposure_spread, facts.exposure_rest) == (0, 0.0, 0.0)
+    gains = gather_facts(scene_of(train, np.reshape(points, (-1, 3))), CPU, with_exposures=True).gains
+    assert not gains.compared.any() and (gains.spread, gains.rest) == (0.0, 0.0)

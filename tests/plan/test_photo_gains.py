@@ -6,13 +6,15 @@ import torch
 from helpers import textured_corner
 from helpers.textured_corner import FOCAL, render_corner, viewmat
 
+from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.plan import gather_facts
 from turbogs_plugin.plan.photo_gains import _comparable, compare_exposures, fit_gains
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.photos import Photos
-from turbogs_plugin.train.training_state import first_exposures
+from turbogs_plugin.train.training_state import set_gains
 from turbogs_plugin.types import Cameras
 
+CPU = torch.device("cpu")
 VIEWS = 14
 RANDOM = np.random.default_rng(3).uniform(0.7, 1.25, (VIEWS, 3))
 """Gains that differ from photo to photo and between channels."""
@@ -99,27 +101,19 @@ def test_points_in_the_air_compare_nothing():
     assert compare_exposures(corner(RANDOM), away).compared.sum() <= 2
 
 
-def test_the_fact_is_of_the_training_photos():
-    views = corner(RANDOM)
-    colors = torch.zeros(1500, 3, dtype=torch.uint8)
-    scene = Scene("c", views, views, points(), colors, Frame(np.zeros(3), 1.0), 1.0)
-    assert gather_facts(scene, torch.device("cpu")).exposure_views is None
-    facts = gather_facts(scene, torch.device("cpu"), with_exposures=True)
-    found = compare_exposures(views, points())
-    assert (facts.exposure_spread, facts.exposure_rest) == (found.spread, found.rest)
-    assert facts.exposure_views == VIEWS and found.rest > 0.1
-
-
-def test_training_starts_from_the_gains():
+def test_training_starts_from_the_gains_of_the_plan():
     """Known to a few percent before the first iteration, with the identity as their mean."""
     views = corner(RANDOM)
     scene = Scene("c", views, views, points(), torch.zeros(1500, 3, dtype=torch.uint8), Frame(np.zeros(3), 1.0), 1.0)
-    offsets = first_exposures(scene, False, torch.device("cpu")).offsets
+    assert gather_facts(scene, CPU).gains is None
+    found, exposures = gather_facts(scene, CPU, with_exposures=True).gains, Exposures.identity(VIEWS, CPU)
+    assert found.compared.all() and found.rest > 0.1
+    set_gains(exposures, found)
+    offsets = exposures.offsets
     wanted = torch.from_numpy(RANDOM / RANDOM.mean(axis=0) - 1.0).float()
     torch.testing.assert_close(offsets.diagonal(dim1=1, dim2=2), wanted, rtol=0, atol=0.06)
     assert offsets.mean(dim=0).abs().max() < 1e-6
     assert (offsets - torch.diag_embed(offsets.diagonal(dim1=1, dim2=2)) @ torch.eye(3, 4) == 0).all()
-    assert not first_exposures(scene, True, torch.device("cpu")).offsets.any()
 
 
 def test_the_fit_passes_over_pairs_that_are_wrong():

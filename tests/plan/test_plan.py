@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 
+import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import TINY, stop_after
@@ -13,6 +14,7 @@ from turbogs_plugin.config.configuration import apply_overrides, config_names, l
 from turbogs_plugin.config.sections import AUTO_SETTINGS
 from turbogs_plugin.plan import SceneFacts
 from turbogs_plugin.plan.decisions import RULES, plan_from_facts
+from turbogs_plugin.plan.photo_gains import PhotoGains
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.study import cell as cell_module
 from turbogs_plugin.study.results import StudyFolder
@@ -25,9 +27,6 @@ pytestmark = pytest.mark.usefixtures("plotted")
 MIB = 2**20
 FACTS = SceneFacts(
     train_views=100,
-    exposure_spread=0.05,
-    exposure_rest=0.05,
-    exposure_views=100,
     direction_concentration=0.5,
     photo_bytes=100 * MIB,
     map_bytes=120 * MIB,
@@ -40,6 +39,10 @@ ALL_AUTO = tuple(f"train.{setting}=auto" for setting in RULES)
 
 def facts(**changes) -> SceneFacts:
     return dataclasses.replace(FACTS, **changes)
+
+
+def gains(spread: float, rest: float = 0.05, compared: int = 100) -> dict[str, PhotoGains]:
+    return {"gains": PhotoGains(np.zeros((100, 3)), np.arange(100) < compared, spread, rest)}
 
 
 def decision(setting: str, of: SceneFacts, *overrides: str):
@@ -55,11 +58,11 @@ BOTH_SIDES = [
     ("backdrop", {"direction_concentration": 0.95}, ("density.max_gaussians=3000",), False, "leave no room"),
     ("background", {"transparent": False}, (), "black", "opaque"),
     ("background", {"transparent": True}, (), "random", "transparent"),
-    ("exposure", {"exposure_spread": 0.1, "exposure_rest": 0.025}, (), True, "before and after <= 0.25 of that"),
-    ("exposure", {"exposure_spread": 0.1, "exposure_rest": 0.026}, (), False, "before and after > 0.25 of that"),
-    ("exposure", {"exposure_spread": 0.04, "exposure_rest": 0.0}, (), False, "0.04 stops apart < 0.05"),
-    ("exposure", {"exposure_spread": 1.0, "exposure_views": 49}, (), False, "only 49 of 100 photos could be"),
-    ("exposure", {"exposure_spread": 1.0, "transparent": True}, (), False, "transparent"),
+    ("exposure", gains(0.1, 0.025), (), True, "before and after <= 0.25 of that"),
+    ("exposure", gains(0.1, 0.026), (), False, "before and after > 0.25 of that"),
+    ("exposure", gains(0.04, 0.0), (), False, "0.04 stops apart < 0.05"),
+    ("exposure", gains(1.0, compared=49), (), False, "only 49 of 100 photos could be"),
+    ("exposure", {"transparent": True, **gains(1.0)}, (), False, "transparent"),
     ("dropout", {"reprojection_error": 0.4}, (), 0.2, "points 0.40 pixels from where photos show them >= 0.4"),
     ("dropout", {"reprojection_error": 0.39}, (), 0.0, "points 0.39 pixels from where photos show them < 0.4"),
     ("dropout", {}, (), 0.0, "no reconstruction says how accurate the cameras are"),

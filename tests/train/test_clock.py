@@ -15,13 +15,6 @@ from turbogs_plugin.train import session as sessions
 from turbogs_plugin.train.clock import WallClock, WallRecord
 
 
-def wall_of(clock: SimulatedTime, seconds: float) -> WallClock:
-    """A clock on the wall of a command that began some seconds ago."""
-    made = WallClock()
-    clock.passes(seconds)
-    return made
-
-
 pytestmark = pytest.mark.usefixtures("plotted")
 
 
@@ -39,21 +32,16 @@ def test_a_run_records_the_wall_until_its_model_and_the_parts_of_its_report(capt
         write_report(session)
 
     monkeypatch.setattr(sessions, "save_ply", saving)
-    session = run.train(tiny_config(capture), tmp_path / "run", reporting, wall_of(clock, 1000.0))
+    wall = WallClock()
+    clock.passes(1000.0)
+    session = run.train(tiny_config(capture), tmp_path / "run", reporting, wall)
     record = WallRecord.read(session.folder.wall)
     assert record.train_seconds == pytest.approx(14.07, abs=1e-3)
     assert record.train_seconds == pytest.approx(session.history[-1].train_seconds)
     assert record.wall_seconds == pytest.approx(1024.07, abs=2e-3)
-    parts = record.parts
-    expected = {
-        "interpreter and imports": 1000.0,
-        "initial maps": 0.07,
-        "training": 14.0,
-        "model": 10.0,
-        "report": 100.0,
-    }
-    assert {name: parts[name] for name in expected} == pytest.approx(expected, abs=2e-3)
-    assert {"photos", "plan", "initial model", "first evaluation", "evaluations", "checkpoints"} <= set(parts)
+    expected = {"interpreter and imports": 1000.0, "initial maps": 0.07, "training": 14.0, "model": 10.0, "report": 100}
+    assert {name: record.parts[name] for name in expected} == pytest.approx(expected, abs=2e-3)
+    assert {"photos", "plan", "initial model", "first evaluation", "evaluations", "checkpoints"} <= set(record.parts)
     assert "| 1024.1 |" in session.folder.report.read_text()
 
 

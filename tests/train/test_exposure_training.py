@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import assert_identical, tiny_capture, tiny_config
+from helpers.framework_runs import assert_identical, tiny_capture, tiny_config, tiny_trainer
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
@@ -23,7 +23,6 @@ from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("plotted")
 
-CPU = torch.device("cpu")
 DARK = 2
 """The training photo that has half the exposure."""
 ON = ("train.exposure=true", "schedule.min_views=7", "schedule.max_views=7")
@@ -44,7 +43,7 @@ def scene(capture):
 
 
 def trainer_of(scene, *overrides: str) -> Trainer:
-    trainer = Trainer(tiny_config("capture", *overrides).without_plan(), scene, CPU)
+    trainer = tiny_trainer(scene, *overrides)
     trainer.initialise_maps()
     return trainer
 
@@ -75,10 +74,8 @@ def test_a_run_goes_on_bit_for_bit_and_from_host_memory(scene, loss):
     overrides = ("train.exposure=true", f"loss.type={loss}", "schedule.max_views=2")
     hosted = (*overrides, "train.pixels_place=host")
     whole, first, second = trainer_of(scene, *overrides), trainer_of(scene, *hosted), trainer_of(scene, *overrides)
-    for _ in range(6):
-        whole.step()
-    for _ in range(3):
-        first.step()
+    for trainer in 3 * (first, whole, whole):
+        trainer.step()
     second.load_state_dict(first.state_dict())
     for _ in range(3):
         second.step()
@@ -131,9 +128,8 @@ def test_test_views_are_shown_with_what_their_neighbours_have(scene):
     assert after.l1 == pytest.approx(float((shown - scene.test.photos.image(0)).abs().mean()), abs=1e-6)
 
 
-NAMES = [f"{number}.jpg" for number in range(40)]
-TRAINED = [name for number, name in enumerate(NAMES) if number % 8]
-TEST = NAMES[::8]
+ROWS = {True: [row for row in range(40) if row % 8], False: [*range(0, 40, 8)]}
+TRAINED, TEST = ([f"{row}.jpg" for row in ROWS[trained]] for trained in (True, False))
 
 
 def of(gains: torch.Tensor) -> torch.Tensor:
@@ -143,24 +139,17 @@ def of(gains: torch.Tensor) -> torch.Tensor:
     return offsets
 
 
-def rows(names: list[str]) -> torch.Tensor:
-    return torch.tensor([NAMES.index(name) for name in names])
-
-
 def test_exposures_that_follow_the_sequence_are_told():
     wave = of(0.4 * torch.sin(torch.arange(40) / 6))
-    told = interpolated_exposures(wave[rows(TRAINED)], TRAINED, TEST)
-    inside = told[1:] - wave[rows(TEST)][1:]  # the first photo has one neighbour
-    assert inside.abs().max() < 0.02 < 0.1 < wave[rows(TEST)].abs().max()
+    told, wanted = interpolated_exposures(wave[ROWS[True]], TRAINED, TEST), wave[ROWS[False]]
+    assert (told[1:] - wanted[1:]).abs().max() < 0.02 < 0.1 < wanted.abs().max()  # the first photo has one neighbour
     assert (told[0] - wave[1]).abs().max() < 0.02
 
 
 def test_exposures_at_random_tell_nothing():
     """The identity is nearer to the truth than neighbours are, and what is told is nearer to the identity still."""
-    random = torch.Generator().manual_seed(3)
-    noise = of(0.3 * torch.randn(40, generator=random))
-    told = interpolated_exposures(noise[rows(TRAINED)], TRAINED, TEST)
-    assert told.norm() < 0.3 * noise[rows(TEST)].norm()
+    noise = of(0.3 * torch.randn(40, generator=torch.Generator().manual_seed(3)))
+    assert interpolated_exposures(noise[ROWS[True]], TRAINED, TEST).norm() < 0.3 * noise[ROWS[False]].norm()
 
 
 @pytest.mark.parametrize("trained", [["a/1.jpg"], ["a/1.jpg", "a/2.jpg"], ["1.jpg", "2.jpg", "3.jpg"]])

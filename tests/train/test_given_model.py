@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 from gsplat import export_splats
-from helpers.framework_runs import tiny_config
+from helpers.framework_runs import assert_identical, tiny_config, tiny_trainer
 from helpers.models import random_gaussians
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -30,7 +30,6 @@ from turbogs_plugin.scene import Frame
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.saved_model import load_given, load_model
-from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.train.training_state import initial_gaussians
 from turbogs_plugin.types import Gaussians
 from turbogs_plugin.viewer.show import open_state
@@ -72,42 +71,23 @@ def assert_alike(a: Gaussians, b: Gaussians) -> None:
         torch.testing.assert_close(value, other, msg=name, rtol=1e-4, atol=1e-5)
 
 
-def files_of(finished: Path, folder: Path) -> dict[str, Path]:
-    """The run's model in every form in which it can be given."""
-    model = read_ply(finished / "model.ply")
-    theirs = {name: value.float() for name, value in model.items()}
-    export_splats(**theirs, save_to=str(folder / "gsplat.ply"))
-    return {
-        "ours": finished / "model.ply",
-        "gsplat's ply": folder / "gsplat.ply",
-        "gsplat's pt": save_splats(folder / "ckpt_6999_rank0.pt", model),
-        "checkpoint": latest_checkpoint(finished / "checkpoints"),
-        "run": finished,
-    }
-
-
-def test_a_model_is_the_same_in_every_form(finished, capture, tmp_path, recwarn):
-    scene = load_scene(capture)
-    trained = load_model(finished, CPU).gaussians
-    for file in files_of(finished, tmp_path).values():
-        assert_alike(load_given(file, scene), trained)
-    assert not [warning for warning in recwarn if issubclass(warning.category, UserWarning)]
-
-
 def test_a_given_model_has_the_tables_and_pictures_of_its_run(turbogs, finished, capture, tmp_path):
+    """In every form in which it can be given: ours, gsplat's two, a checkpoint, a run."""
     asked, pictures = table(turbogs("eval", finished, "--device", "cpu")[1]), tmp_path / "pictures"
-    for file in files_of(finished, tmp_path).values():
+    model, theirs = read_ply(finished / "model.ply"), tmp_path / "gsplat.ply"
+    export_splats(**{name: value.float() for name, value in model.items()}, save_to=str(theirs))
+    pt, checkpoint = save_splats(tmp_path / "ckpt_6999_rank0.pt", model), latest_checkpoint(finished / "checkpoints")
+    for file in (finished / "model.ply", theirs, pt, checkpoint, finished):
         code, out, error = turbogs("eval", file, "--scene", capture, "--device", "cpu")
         assert (code, table(out), error) == (0, asked, "")
         assert f"{file}, " in out
     assert turbogs("render", finished, "--device", "cpu")[0] == 0
     given = ("--scene", capture, "--out", pictures, "--device", "cpu")
     assert turbogs("render", finished / "model.ply", *given)[0] == 0
-    ours, theirs = (
-        [np.asarray(Image.open(path), dtype=int) for path in sorted(place.glob("test/*.png"))]
-        for place in (finished / "renders", pictures)
-    )
-    assert ours and np.abs(np.stack(ours) - np.stack(theirs)).mean() < 0.1
+    ours, theirs = (sorted(folder.glob("test/*.png")) for folder in (finished / "renders", pictures))
+    assert ours and len(ours) == len(theirs)
+    for pair in zip(ours, theirs, strict=True):
+        assert np.abs(np.subtract(*(np.asarray(Image.open(path), int) for path in pair))).mean() < 0.1
 
 
 @pytest.mark.parametrize("world", range(4))
@@ -125,16 +105,12 @@ def test_a_model_of_gsplats_normalised_world_is_brought_back(finished, capture, 
 
 def test_the_world_is_said_by_a_setting_in_training_and_evaluation(turbogs, finished, capture, tmp_path):
     file = save_splats(tmp_path / "ckpt.pt", worlds_of(capture)[2].apply(read_ply(finished / "model.ply")))
-    config = tiny_config(capture, f"train.init={file}", "train.init_world=gsplat", "train.sh_degree=1").without_plan()
+    start = tiny_trainer(capture, f"train.init={file}", "train.init_world=gsplat", "train.sh_degree=1").gaussians
     trained = load_model(finished, CPU).gaussians
-    torch.testing.assert_close(
-        Trainer(config, load_scene(capture), CPU).gaussians.means, trained.means, atol=1e-3, rtol=0
-    )
-    given = ("eval", file, "--scene", capture, "--device", "cpu", "train.init_world=gsplat")
-    measured, expected = (
-        float(re.search(r"mean of 1\W+([\d.]+)", turbogs(*call)[1])[1])
-        for call in (given, ("eval", finished, "--device", "cpu"))
-    )
+    torch.testing.assert_close(start.means, trained.means, atol=1e-3, rtol=0)
+    calls = (("eval", file, "--scene", capture, "train.init_world=gsplat"), ("eval", finished))
+    told = (turbogs(*call, "--device", "cpu")[1] for call in calls)
+    measured, expected = (float(re.search(r"mean of 1\W+([\d.]+)", text)[1]) for text in told)
     assert measured == pytest.approx(expected, abs=0.2)
     checkpoint = latest_checkpoint(finished / "checkpoints")  # knows its frame
     assert_alike(load_given(checkpoint, load_scene(capture), "gsplat"), trained)
@@ -188,7 +164,7 @@ def test_a_model_of_antialiased_training_is_drawn_as_it_was_trained(finished, ca
     plain = render_image(state.gaussians, scene.test.cameras, **state.look.options | {"antialiased": False}).colors
     assert (seen - plain).abs().max() > 0.01
     with pytest.warns(UserWarning, match="antialiased training"):
-        Trainer(tiny_config(capture, f"train.init={tmp_path / 'a.ply'}").without_plan(), scene, CPU)
+        tiny_trainer(scene, f"train.init={tmp_path / 'a.ply'}")
 
 
 def test_the_newest_model_in_folders_of_other_trainers(finished, capture, tmp_path, turbogs):
@@ -245,14 +221,12 @@ def test_a_stopped_run_goes_on_without_the_model_that_it_started_from(finished, 
     start.unlink()
     resumed = run.resume(tmp_path / "stopped")
     assert resumed.resumed
-    for (_, value), (_, other) in zip(whole.trainer.gaussians.items(), resumed.trainer.gaussians.items(), strict=True):
-        assert torch.equal(value, other)
+    assert_identical(dict(whole.trainer.gaussians.items()), dict(resumed.trainer.gaussians.items()))
 
 
 def test_a_model_that_is_larger_than_the_cap_is_refused(finished, capture):
-    config = tiny_config(capture, f"train.init={finished}", "density.max_gaussians=100").without_plan()
     with pytest.raises(InputError, match=r"more than density\.max_gaussians 100 allows.*start from points"):
-        Trainer(config, load_scene(capture), CPU)
+        tiny_trainer(capture, f"train.init={finished}", "density.max_gaussians=100")
 
 
 def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
@@ -276,10 +250,9 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         "other keys": (saved("weights.pt", {"conv1": torch.zeros(3), "bias": torch.zeros(1)}), "bias, conv1"),
         "code": (saved("code.pt", {"splats": Path("x")}), "more than plain tensors"),
         "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
-        **{
-            kind: (written(f"m.{kind}", b"x"), words)
-            for kind, words in (("sog", "splat-transform"), ("ckpt", "ns-export"), ("pth", "point_cloud.ply"))
-        },
+        "PlayCanvas's": (written("m.sog", b"x"), "splat-transform"),
+        "nerfstudio's": (written("m.ckpt", b"x"), "ns-export"),
+        "Inria's": (written("m.pth", b"x"), "point_cloud.ply"),
         "not a spz": (written("text.spz", b"text"), "cannot read"),
     }
 
@@ -287,16 +260,10 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
 def test_what_is_no_model_is_one_line(turbogs, capture, tmp_path):
     out = tmp_path / "out"
     for what, (file, words) in bad_files(tmp_path).items():
-        calls = (
-            [("eval", file, "--scene", capture)]
-            if what != "absent"
-            else [
-                ("train", capture, "--init", file, "--out", out),
-                ("eval", file, "--scene", capture),
-                ("render", file, "--scene", capture, "--out", out),
-                ("export", file, "--scene", capture, "--out", out.with_suffix(".ply")),
-            ]
-        )
+        calls = [("eval", file, "--scene", capture)]
+        if what == "absent":
+            calls += [("train", capture, "--init", file, "--out", out)]
+            calls += [(verb, file, "--scene", capture, "--out", f"{out}.ply") for verb in ("render", "export")]
         for call in calls:
             code, printed, error = turbogs(*call)
             assert code == 2 and printed == "" and error.count("\n") == 1, (what, call[0], error)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.framework_runs import tiny_capture, tiny_trainer
 from torch import Tensor
 
 from turbogs_plugin.captures import load_scene
@@ -28,10 +28,6 @@ def scene(tmp_path_factory):
     return load_scene(tiny_capture(tmp_path_factory.mktemp("iteration")))
 
 
-def make_trainer(scene, *overrides: str) -> Trainer:
-    return Trainer(tiny_config("capture", *overrides).without_plan(), scene, CPU)
-
-
 def dense_errors(trainer: Trainer, degree: int) -> list[Tensor]:
     """[H * W] of each training view: the L1 norms of a dense render against its photo."""
     views, settings = trainer.views, trainer.config.raster
@@ -47,7 +43,7 @@ def mapped_errors(trainer: Trainer) -> list[Tensor]:
 
 
 def test_the_maps_begin_with_the_errors_of_the_initial_model(scene):
-    trainer = make_trainer(scene)
+    trainer = tiny_trainer(scene)
     trainer.initialise_maps()
     expected = dense_errors(trainer, degree=0)
     for found, errors in zip(mapped_errors(trainer), expected, strict=True):
@@ -58,7 +54,7 @@ def test_the_maps_begin_with_the_errors_of_the_initial_model(scene):
 def test_an_iteration_learns_the_errors_of_the_views_that_it_drew(scene):
     """With beta = 1 the maps then hold, at the pixels drawn, what a dense render of the model before the step gives,
     with the bands in use at that iteration; and elsewhere what they held."""
-    trainer = make_trainer(scene, "maps.beta=1")
+    trainer = tiny_trainer(scene, "maps.beta=1")
     trainer.initialise_maps()
     generator = torch.Generator().manual_seed(0)
     trainer.gaussians.shN += 0.2 * torch.randn(trainer.gaussians.shN.shape, generator=generator)
@@ -78,7 +74,7 @@ def test_an_iteration_learns_the_errors_of_the_views_that_it_drew(scene):
 
 def test_iterations_before_a_change_of_the_set_are_not_made_again(scene):
     """The change would be made twice."""
-    trainer = make_trainer(scene)
+    trainer = tiny_trainer(scene)
     trainer.iteration = 7
     rows = torch.arange(len(trainer.gaussians))
     trainer.follow(RowUpdate(rows, torch.zeros(len(rows), dtype=torch.bool), {}))
@@ -90,7 +86,7 @@ def test_iterations_before_a_change_of_the_set_are_not_made_again(scene):
 
 
 def test_lost_iterations_are_made_again(scene):
-    trainer, seen = make_trainer(scene), []
+    trainer, seen = tiny_trainer(scene), []
     trainer.initialise_maps()
     trainer.on_samples = lambda _: seen.append(trainer.iteration)
     trainer.refine = lambda step: None  # no change of the set, before which none is made again
@@ -103,7 +99,7 @@ def test_lost_iterations_are_made_again(scene):
 
 def test_an_evaluation_measures_what_a_screen_shows(scene):
     """Colours beyond white are white."""
-    trainer = make_trainer(scene)
+    trainer = tiny_trainer(scene)
     trainer.gaussians.sh0 += 100.0
     trainer.gaussians.opacities += 10.0
     settings = trainer.config.raster
@@ -116,7 +112,7 @@ def test_an_evaluation_measures_what_a_screen_shows(scene):
 
 def test_what_an_iteration_leaves_out_does_not_learn_and_the_end_has_all(scene, monkeypatch):
     still = ("density.refine_from=1000", "density.final_keep=1", "train.distant_size=0")
-    trainer = make_trainer(scene, "train.dropout=0.4", "train.iterations=20", *still)
+    trainer = tiny_trainer(scene, "train.dropout=0.4", "train.iterations=20", *still)
     trainer.initialise_maps()
     render, shares = trainer.engine.render, []
     monkeypatch.setattr(trainer.engine, "render", lambda *all: shares.append(all[3].dropout.share) or render(*all))
@@ -134,15 +130,8 @@ def test_what_an_iteration_leaves_out_does_not_learn_and_the_end_has_all(scene, 
 
 
 def test_the_mean_begins_anew_where_rows_change_places(scene):
-    trainer = make_trainer(scene, "train.average_last=1.0")
+    trainer = tiny_trainer(scene, "train.average_last=1.0")
     trainer.parameter_mean.add(trainer.learnt())
     rows = torch.arange(len(trainer.gaussians)).flip(0)  # as many as before
     trainer.change_rows(RowUpdate(rows, torch.zeros(len(rows), dtype=torch.bool), {}))
     assert trainer.parameter_mean.count == 0
-
-
-def test_bands_begin_at_their_iterations(scene):
-    trainer, degrees = make_trainer(scene, "train.sh_degree=2", "train.sh_interval=4"), []
-    for trainer.iteration in range(10):
-        degrees.append(trainer.sh_degree)
-    assert degrees == [0] * 4 + [1] * 4 + [2] * 2

@@ -18,13 +18,9 @@ class CountingTrainer:
 
     def __init__(self, iterations: int, lost: tuple[int, ...] = (), **settings) -> None:
         train = TrainConfig(iterations=iterations, refine_until=iterations, **settings)
-        self.config = SimpleNamespace(train=train)
-        self.iteration = 0
-        self.steps: list[int] = []
-        self.gaussians = range(10)
+        self.config, self.steps = SimpleNamespace(train=train), []
         self.initialised = self.concluded = False
-        self._lost = set(lost)
-        self._unnoticed = 0
+        self._lost, self.iteration, self._unnoticed = set(lost), 0, 0
 
     def initialise_maps(self) -> None:
         self.initialised = True
@@ -68,12 +64,9 @@ class Diary(Listener):
         self.lines.append(("checkpoint", loop.trainer.iteration))
 
 
-class StopAt(Listener):
-    def __init__(self, iteration: int) -> None:
-        self.iteration = iteration
-
+class StopAt5(Listener):
     def advanced(self, loop: TrainingLoop) -> None:
-        if loop.trainer.iteration == self.iteration:
+        if loop.trainer.iteration == 5:
             loop.stop()
 
 
@@ -83,8 +76,7 @@ def test_an_evaluation_comes_before_the_checkpoint_of_the_same_place():
     loop.run()
     assert diary.lines == [("begun", 0), *(("evaluation", 3), ("checkpoint", 3)), ("evaluation", 6), ("checkpoint", 6)]
     assert loop.finished and not loop.stopped and trainer.steps == [1, 2, 3, 4, 5, 6]
-    assert trainer.concluded
-    assert trainer.length == (6, 6)
+    assert trainer.concluded and trainer.length == (6, 6)
 
 
 @pytest.mark.parametrize("lost", [(3,), (2,), (1,), (6,)])
@@ -101,7 +93,7 @@ def test_no_iteration_is_missing_at_a_mark(lost):
 def test_no_iteration_is_missing_at_a_stop():
     """Back at a place that was evaluated and saved before, it is not evaluated and saved again."""
     trainer, diary = CountingTrainer(9, lost=(4,), evaluate_at=(1 / 3,), checkpoint_every=3), Diary()
-    loop = TrainingLoop(trainer, listeners=[diary, StopAt(5)])
+    loop = TrainingLoop(trainer, listeners=[diary, StopAt5()])
     loop.run()
     assert loop.stopped and not loop.finished and trainer.iteration == 3 and not trainer.concluded
     assert diary.lines == [("begun", 0), ("evaluation", 3), ("checkpoint", 3)]

@@ -5,23 +5,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.framework_runs import assert_identical, stop_after, tiny_capture, tiny_config
+from helpers.framework_runs import assert_identical, stop_after, tiny_config, tiny_trainer
 
-from turbogs_plugin.captures import load_scene
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.parameter_mean import AVERAGE_EVERY, ParameterMean
 from turbogs_plugin.train.run import resume, train
-from turbogs_plugin.train.session import RunSession
 from turbogs_plugin.train.trainer import Trainer
 
-CPU = torch.device("cpu")
 AVERAGED = ("train.iterations=22", "train.average_last=0.6", "density.final_keep=1.0")
 """After the last change of the set, at iteration 9, these count: 12, 16, 20, and the end, 22."""
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return tiny_capture(tmp_path_factory.mktemp("captures"))
 
 
 class Kept(Listener):
@@ -37,24 +29,15 @@ class Kept(Listener):
 
 
 def trained(capture, *overrides: str) -> tuple[Trainer, Kept]:
-    kept = Kept()
-    loop = TrainingLoop(
-        Trainer(tiny_config(capture, *overrides).without_plan(), load_scene(capture), CPU), None, [kept]
-    )
-    loop.run()
-    return loop.trainer, kept
+    kept, trainer = Kept(), tiny_trainer(capture, *overrides)
+    TrainingLoop(trainer, None, [kept]).run()
+    return trainer, kept
 
 
 @pytest.fixture(scope="module")
 def averaged(capture) -> tuple[Trainer, Kept]:
     """Not to be changed."""
     return trained(capture, *AVERAGED)
-
-
-@pytest.fixture(scope="module")
-def whole(capture, tmp_path_factory) -> RunSession:
-    """A run with the settings of `averaged`."""
-    return train(tiny_config(capture, *AVERAGED), tmp_path_factory.mktemp("runs") / "whole")
 
 
 def tensors(value: float, rows: int = 2) -> dict[str, torch.Tensor]:
@@ -110,7 +93,7 @@ def test_the_model_at_the_end_is_the_mean(averaged):
 def test_training_itself_is_the_same(averaged, capture):
     """Until the end, where the model alone becomes another."""
     trainer, kept = averaged
-    plain = Trainer(tiny_config(capture, *AVERAGED, "train.average_last=0").without_plan(), load_scene(capture), CPU)
+    plain = tiny_trainer(capture, *AVERAGED, "train.average_last=0")
     TrainingLoop(plain).run()
     assert_identical(kept.learnt[22], plain.learnt())
     for name in ("optimizer", "density", "maps"):
@@ -134,7 +117,8 @@ def test_exposures_are_averaged_with_the_model(capture):
     assert trainer.exposures.offsets.any()
 
 
-def test_a_resume_within_the_mean_gives_the_same_bits(capture, whole, tmp_path, monkeypatch):
+def test_a_resume_within_the_mean_gives_the_same_bits(capture, tmp_path, monkeypatch):
+    whole = train(tiny_config(capture, *AVERAGED), tmp_path / "whole")
     with monkeypatch.context() as context:
         stop_after(context, 13)
         train(tiny_config(capture, *AVERAGED), tmp_path / "stopped")

@@ -32,9 +32,8 @@ with RunFolder(Path(sys.argv[1])).owned(new=True):
 @pytest.fixture
 def holder(tmp_path):
     """A process that writes to the run `tmp_path / "run"`."""
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLDING, tmp_path / "run"], stdout=subprocess.PIPE, text=True
-    ) as other:
+    words = [sys.executable, "-c", HOLDING, tmp_path / "run"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout.readline() == "held\n"
         yield other
         other.kill()
@@ -43,10 +42,7 @@ def holder(tmp_path):
 def test_a_folder_has_one_owner_and_a_dead_one_has_none(holder, tmp_path, capsys):
     folder = RunFolder(tmp_path / "run")
     for new in (False, True):
-        with (
-            pytest.raises(InputError, match=f"process {holder.pid} of .* writes to .*: wait"),
-            folder.owned(new),
-        ):
+        with pytest.raises(InputError, match=f"process {holder.pid} of .* writes to .*: wait"), folder.owned(new):
             pytest.fail("two own it")
     holder.send_signal(signal.SIGKILL)
     holder.wait()
@@ -68,17 +64,12 @@ def test_a_run_and_its_resume_are_refused_while_another_writes(holder, capture, 
     assert sorted(folder.path.iterdir()) == before
 
 
-def test_a_new_folder_that_another_has_written_to_is_refused(tmp_path):
-    folder = RunFolder(tmp_path / "run")
-    folder.path.mkdir()
-    folder.model.touch()
-    with pytest.raises(InputError, match="not empty"), folder.owned(new=True):
-        pytest.fail("two own it")
-
-
-def test_a_lock_that_is_a_link_is_refused(tmp_path):
+def test_a_new_folder_that_another_has_written_to_and_a_lock_that_is_a_link_are_refused(tmp_path):
     folder, victim = RunFolder(tmp_path), tmp_path / "victim"
     victim.write_text("mine")
+    with pytest.raises(InputError, match="not empty"), folder.owned(new=True):
+        pytest.fail("two own it")
+    folder.lock.unlink(missing_ok=True)
     folder.lock.symlink_to(victim)
     with pytest.raises(InputError, match="is a link: remove it"), folder.owned():
         pytest.fail("it was followed")

@@ -6,16 +6,12 @@ from dataclasses import dataclass, field, fields
 
 import pytest
 import torch
-from helpers.framework_runs import tiny_config
+from helpers.framework_runs import tiny_trainer
 from helpers.losing_engine import LosingEngine
 
-from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
-from turbogs_plugin.train.trainer import Trainer
-
-CPU = torch.device("cpu")
 
 
 @dataclass
@@ -50,7 +46,7 @@ class OwnCode:
 
 
 def make_trainer(capture):
-    trainer = Trainer(tiny_config(capture).without_plan(), load_scene(capture), CPU)
+    trainer = tiny_trainer(capture)
     trainer.initialise_maps()
     return trainer
 
@@ -66,6 +62,10 @@ def assert_equal(one, other):
         assert torch.equal(value, getattr(other.gaussians, name)), name
     for name in ("errors", "stamps", "view_sums"):
         assert torch.equal(getattr(one.maps, name), getattr(other.maps, name)), name
+    assert_equal_statistics(one, other)
+
+
+def assert_equal_statistics(one, other):
     for item in fields(one.density.stats):
         assert torch.equal(getattr(one.density.stats, item.name), getattr(other.density.stats, item.name)), item.name
 
@@ -97,9 +97,7 @@ def test_statistics_are_written_once_whatever_the_optimizer_does(capture, calls)
     run(usual, 1)
     run(odd, 1)
     assert float(usual.density.stats.view_counts.sum()) > 0
-    for item in fields(usual.density.stats):
-        found, expected = getattr(odd.density.stats, item.name), getattr(usual.density.stats, item.name)
-        assert torch.equal(found, expected), item.name
+    assert_equal_statistics(odd, usual)
 
 
 class Restless:

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import stop_after, tiny_config
+from helpers.framework_runs import stop_after, tiny_config, tiny_trainer
 from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.config.configuration import resolve
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.config.sections import TrainConfig
 from turbogs_plugin.errors import InputError, TrainingStopped
@@ -19,29 +18,11 @@ from turbogs_plugin.train import pace as pacing
 from turbogs_plugin.train import run, session
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import read_history
+from turbogs_plugin.train.loop import Listener
 from turbogs_plugin.train.saved_model import load_model
 from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("plotted")
-
-
-@pytest.fixture
-def counts(monkeypatch) -> list[int]:
-    """Numbers of Gaussians, at the start and after every iteration of every trainer."""
-    seen: list[int] = []
-    setup, step = Trainer.initialise_maps, Trainer.step
-
-    def initialising(trainer):
-        seen.append(len(trainer.gaussians))
-        setup(trainer)
-
-    def stepping(trainer):
-        step(trainer)
-        seen.append(len(trainer.gaussians))
-
-    monkeypatch.setattr(Trainer, "initialise_maps", initialising)
-    monkeypatch.setattr(Trainer, "step", stepping)
-    return seen
 
 
 def growing(trainer: Trainer) -> float:
@@ -73,9 +54,8 @@ def test_a_time_budget_holds(turbogs, capture, tmp_path, monkeypatch):
 def test_settings_that_count_iterations_are_scaled_to_the_time(capture, tmp_path, monkeypatch):
     """By iterations that are timed beforehand, which change neither the model nor what is drawn."""
     SimulatedTime(monkeypatch, tick=1e-9).in_iterations(monkeypatch, lambda trainer: 0.1)
-    config = tiny_config(
-        capture, "budget.time=10.05s", "train.iterations=1000", "train.refine_until=700"
-    ).without_plan()
+    lengths = ("budget.time=10.05s", "train.iterations=1000", "train.refine_until=700")
+    config = tiny_config(capture, *lengths).without_plan()
     scene, device = load_scene(capture), torch.device("cpu")
     fitted, seconds = pacing.fitted_to_time(config, scene, device)
     assert seconds == pytest.approx(0.4, abs=1e-3) and (fitted.train.iterations, fitted.train.refine_until) == (96, 67)
@@ -111,17 +91,24 @@ def test_a_run_by_time_goes_on_after_a_stop(capture, tmp_path, monkeypatch):
     assert lengths[0][0] != first.trainer.config.train.iterations
     assert second.history[-1].train_seconds == pytest.approx(4.0, rel=0.1)
     assert second.history[-1].train_seconds == pytest.approx(clock.now - began, abs=0.01)
-    assert len(second.history) == 4
-    assert [entry.iteration for entry in second.history] == sorted({entry.iteration for entry in second.history})
+    iterations = [entry.iteration for entry in second.history]
+    assert len(iterations) == 4 and iterations == sorted(set(iterations))
 
 
 @pytest.mark.parametrize("cap", [50, 120])
-def test_a_cap_holds_for_the_finished_model(capture, tmp_path, counts, cap):
+def test_a_cap_holds_for_the_finished_model(capture, tmp_path, cap):
     """By the initial model, too, where the capture has more points than that; and what stops growth is the room that
     the cap and the final prunings leave, which the larger cap's run fills."""
-    points, most = len(load_scene(capture).points), int(cap / 0.95**2)
+    points, most, counts = len(load_scene(capture).points), int(cap / 0.95**2), []
+
+    class Counting(Listener):
+        def begun(self, loop):
+            counts.append(len(loop.trainer.gaussians))
+
+        advanced = begun
+
     config = tiny_config(capture, f"density.max_gaussians={cap}", "train.camera_clearance=false")
-    outcome = run.train(config, tmp_path / "run")
+    outcome = run.train(config, tmp_path / "run", watch=[lambda session: Counting()])
     assert counts[0] == min(points, cap)
     assert cap <= max(counts) <= most != points and (max(counts) == most or cap < points)
     assert outcome.history[-1].num_gaussians == counts[-1] <= cap
@@ -129,9 +116,8 @@ def test_a_cap_holds_for_the_finished_model(capture, tmp_path, counts, cap):
 
 
 def test_a_cap_without_room_beside_the_backdrop_is_refused(capture):
-    config = tiny_config(capture, "density.max_gaussians=3000", "train.backdrop=true").without_plan()
     with pytest.raises(InputError, match="no room beside the 3000"):
-        Trainer(config, load_scene(capture), torch.device("cpu"))
+        tiny_trainer(capture, "density.max_gaussians=3000", "train.backdrop=true")
 
 
 @pytest.fixture
@@ -141,15 +127,6 @@ def stopped(capture, tmp_path, monkeypatch) -> Path:
         stop_after(context, 5)
         run.train(tiny_config(capture), tmp_path / "run")
     return tmp_path / "run"
-
-
-def change_config(folder: Path, **sections: dict) -> None:
-    """Rewrite sections of a run's configuration."""
-    config = run.RunFolder(folder).read_config()
-    mapping = config.to_mapping()
-    for name, fields in sections.items():
-        mapping[name] |= fields
-    (folder / "config.yaml").write_text(resolve(mapping).to_yaml())
 
 
 @pytest.mark.parametrize("place", [(Trainer, "__init__"), (Trainer, "load_state_dict"), (session, "place_views")])
@@ -168,13 +145,13 @@ def test_a_capture_that_does_not_fit_is_refused(capture, stopped, tmp_path, monk
 
 def test_a_resumed_run_is_held_to_its_memory(stopped, monkeypatch):
     """Before anything of it is on the device."""
-    change_config(stopped, budget={"max_memory": "2GiB"})
-    held = []
-    build = Trainer.__init__
+    limited = run.RunFolder(stopped).read_config().changed(budget={"max_memory": "2GiB"})
+    (stopped / "config.yaml").write_text(limited.to_yaml())
+    held, build = [], Trainer.__init__
 
-    def building(trainer, *arguments):
+    def building(trainer, *arguments, **options):
         assert held == [2**31]
-        build(trainer, *arguments)
+        build(trainer, *arguments, **options)
 
     monkeypatch.setattr(run, "hold_to_limit", lambda config, device: held.append(config.budget.memory_bytes()))
     monkeypatch.setattr(Trainer, "__init__", building)

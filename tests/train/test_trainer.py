@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import assert_identical, stop_after, tiny_config, tiny_settings
+from helpers.framework_runs import assert_identical, stop_after, tiny_config, tiny_settings, tiny_trainer
 from helpers.processes import ended, said, start_ranks
 from PIL import Image
 
@@ -65,8 +65,7 @@ def test_a_run_leaves_everything_that_it_promises(whole, capture):
     assert history[-1]["psnr"] == pytest.approx(measured.mean.psnr) and len(measured.views) == 1
 
     page = folder.report.read_text()
-    said = ("LPIPS was not computed", "FPS")
-    for promised in ("psnr.png", "l1.png", "test-000.jpg", "iterations: 14", "gsplat", *said):
+    for promised in ("psnr.png", "l1.png", "test-000.jpg", "iterations: 14", "gsplat", "LPIPS was not computed", "FPS"):
         assert promised in page
     for name in ("psnr.png", "l1.png", "test-000.jpg"):
         Image.open(folder.path / "report" / name).verify()
@@ -76,7 +75,7 @@ def test_a_run_leaves_everything_that_it_promises(whole, capture):
 
 def test_moments_and_statistics_follow_their_gaussians(capture):
     """A change of the set, which the trainer brings into the order of space: every row is still its Gaussian's."""
-    trainer = Trainer(tiny_config(capture).without_plan(), load_scene(capture), torch.device("cpu"))
+    trainer = tiny_trainer(capture)
     moments, count = trainer.optimizer.moments, len(trainer.gaussians)
     tags = torch.arange(1.0, count + 1)  # which Gaussian a row is, in all that has rows
     trainer.gaussians.sh0[:, 0, 0] = moments.exp_avg[:, 0] = moments.exp_avg_shN[:, 0] = tags
@@ -94,12 +93,7 @@ def test_moments_and_statistics_follow_their_gaussians(capture):
         assert torch.equal(rows, torch.where(rows == 0, 0.0, tags))
 
 
-STOPS = {
-    **dict.fromkeys((1, 2, 3, 5, 6), signal.SIGINT),
-    7: signal.SIGTERM,
-    9: signal.SIGHUP,
-    **dict.fromkeys((10, 12), signal.SIGINT),
-}
+STOPS = dict.fromkeys((1, 2, 3, 5, 6, 7, 9, 10, 12), signal.SIGINT) | {7: signal.SIGTERM, 9: signal.SIGHUP}
 """Before and after events of density control, at an evaluation, at checkpoints; by Ctrl-C, and once by `kill` and by a
 terminal that closes."""
 
@@ -126,12 +120,10 @@ def test_a_run_stopped_again_and_again_is_the_same_bit_for_bit(capture, whole, t
         while trainer.iteration < iteration:
             trainer.step()
         assert_identical(trainer.state_dict(), saved(place))
-    resumed = run.resume(place)
-    assert resumed.signal is None
-    assert_identical(saved(whole.folder.path), saved(place))
-    history = resumed.folder.history.read_text()
-    assert run.resume(place).signal is None and resumed.folder.history.read_text() == history
-    assert_identical(saved(whole.folder.path), saved(place))
+    for _ in range(2):
+        resumed = run.resume(place)
+        assert resumed.signal is None
+        assert_identical(saved(whole.folder.path), saved(place))
     histories = (read_history(outcome.folder.history) for outcome in (whole, resumed))
     numbers = [[(e.iteration, e.psnr, e.ssim, e.l1, e.num_gaussians) for e in history] for history in histories]
     assert numbers[0] == numbers[1]
@@ -237,38 +229,34 @@ def test_a_run_without_a_checkpoint_starts_again(capture, whole, tmp_path, monke
     assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
 
 
-def test_a_model_that_is_not_finite_is_never_saved(capture, tmp_path, monkeypatch):
-    def spoil(trainer):
-        trainer.gaussians.means[3] = torch.nan
+def not_finite(trainer):
+    trainer.gaussians.means[3] = torch.nan
 
-    stop_after(monkeypatch, 10, spoil)
-    with pytest.raises(TrainingStopped, match=r"iteration 10: 1 of \d+ Gaussians.*iteration-000005\.pt"):
+
+def all_gone(trainer):
+    nobody = torch.zeros(0, dtype=torch.int64)
+    trainer.follow(RowUpdate(nobody, nobody.bool(), {}))
+
+
+@pytest.mark.parametrize(
+    ("iteration", "lose", "reason"),
+    [(10, not_finite, r"1 of \d+ Gaussians are not finite"), (7, all_gone, "every Gaussian was removed")],
+)
+def test_a_model_that_is_lost_ends_the_run_and_is_never_saved(capture, tmp_path, monkeypatch, iteration, lose, reason):
+    stop_after(monkeypatch, iteration, lose)
+    with pytest.raises(TrainingStopped, match=rf"iteration {iteration}: {reason}.*iteration-000005\.pt"):
         run.train(tiny_config(capture), tmp_path / "run")
     assert saved(tmp_path / "run")["iteration"] == 5
     assert all(value.isfinite().all() for value in saved(tmp_path / "run")["gaussians"].values())
 
 
-def test_a_model_without_gaussians_ends_the_run_with_a_reason(capture, tmp_path, monkeypatch):
-    def all_gone(trainer):
-        nobody = torch.zeros(0, dtype=torch.int64)
-        trainer.follow(RowUpdate(nobody, nobody.bool(), {}))
-
-    stop_after(monkeypatch, 7, all_gone)
-    with pytest.raises(TrainingStopped, match=r"iteration 7: .*every Gaussian.*iteration-000005\.pt"):
-        run.train(tiny_config(capture), tmp_path / "run")
-
-
 def test_non_finite_losses_are_counted(capture, tmp_path, monkeypatch):
-    spoiled = []
-
     def spoil(trainer):
-        trainer.views.photos.colors = trainer.views.photos.colors.float()
-        trainer.views.photos.colors[:] = torch.nan
-        spoiled.append(trainer)
+        trainer.views.photos.colors = trainer.views.photos.colors.float() * torch.nan
 
     stop_after(monkeypatch, 10, spoil)
     outcome = run.train(tiny_config(capture), tmp_path / "run", write_report)
-    assert spoiled and outcome.history[-1].nonfinite_losses == 4
+    assert outcome.history[-1].nonfinite_losses == 4
     assert all(value.isfinite().all() for value in saved(tmp_path / "run")["gaussians"].values())
     assert "non-finite loss: 4" in outcome.folder.report.read_text()
 
@@ -302,8 +290,7 @@ def test_a_capture_made_anew_since_the_run_began_is_refused(capture, whole, tmp_
 
 @pytest.mark.parametrize(("size", "expected"), [(0.0, 40.0), (0.3, 0.3 * 14.0)])
 def test_what_is_far_is_kept_from_growing(capture, size, expected):
-    config = tiny_config(capture, f"train.distant_size={size}", "density.refine_from=100")
-    trainer = Trainer(config.without_plan(), load_scene(capture), torch.device("cpu"))
+    trainer = tiny_trainer(capture, f"train.distant_size={size}", "density.refine_from=100")
     trainer.initialise_maps()
     far = trainer.gaussians.means.norm(dim=1).argmax()
     trainer.gaussians.means[far] *= 15.0 * trainer.extent / trainer.gaussians.means[far].norm()
@@ -314,11 +301,9 @@ def test_what_is_far_is_kept_from_growing(capture, size, expected):
 
 @pytest.mark.parametrize(("clears", "drawn", "remain"), [(True, False, 0), (False, False, 3), (True, True, 3)])
 def test_what_stands_before_a_camera_goes_with_the_next_change(capture, clears, drawn, remain):
-    config = tiny_config(capture, f"train.camera_clearance={clears}", "density.refine_from=1", "density.refine_every=1")
-    scene = replace(load_scene(capture), drawn_points=drawn)
-    trainer = Trainer(config.without_plan(), scene, torch.device("cpu"))
+    trainer = tiny_trainer(replace(load_scene(capture), drawn_points=drawn), f"train.camera_clearance={clears}")
     trainer.initialise_maps()
-    centers = scene.train.cameras.centers
+    centers = trainer.views.cameras.centers
     trainer.gaussians.means[:3] = centers[:3] + 1e-3 * trainer.extent
     trainer.follow(RowUpdate(torch.arange(len(trainer.gaussians)), torch.zeros(len(trainer.gaussians)).bool(), {}))
     near = torch.cdist(trainer.gaussians.means, centers).amin(dim=1) < 0.01 * trainer.extent
@@ -384,21 +369,15 @@ def test_what_a_strategy_of_ones_own_returns_is_refused_and_nothing_is_left(
 def test_a_folder_that_cannot_be_written_is_not_resumed(capture, tmp_path, monkeypatch):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.yaml").write_text(tiny_config(capture).without_plan().to_yaml())
-
-    def refused(folder: Path, given: str) -> None:
-        require_writable(folder / "config.yaml" / "file", given)  # whoever runs this may write to any folder
-
-    monkeypatch.setattr(run, "require_writable", refused)
+    # Whoever runs this may write to any folder.
+    monkeypatch.setattr(run, "require_writable", lambda path, given: require_writable(path / "config.yaml/x", given))
     with pytest.raises(InputError, match=r"what --resume .*run writes cannot be made in .*: choose a folder"):
         run.resume(tmp_path / "run")
 
 
-SHORT = ("train.iterations=2", "train.refine_until=1", "train.device=cpu")
-
-
 def test_a_folder_is_read_as_the_section_scene_says(capture):
-    models = [run.fit(given, *SHORT, "scene.factor=2") for given in (str(capture), capture, load_scene(capture, 2))]
-    whole = run.fit(load_scene(capture), *SHORT)
-    for name, value in models[2].items():
-        assert all(torch.equal(getattr(model, name), value) for model in models[:2])
-    assert not torch.equal(whole.sh0, models[0].sh0)
+    short = ("train.iterations=2", "train.refine_until=1", "train.device=cpu")
+    models = [run.fit(given, *short, "scene.factor=2") for given in (str(capture), capture, load_scene(capture, 2))]
+    for model in models[:2]:
+        assert_identical(dict(model.items()), dict(models[2].items()))
+    assert not torch.equal(run.fit(load_scene(capture), *short).sh0, models[0].sh0)

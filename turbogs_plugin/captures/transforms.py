@@ -22,7 +22,7 @@ from turbogs_plugin.captures.starting_points import clouds_beside, read_cloud
 from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens, lens_of_camera
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import viewmat_of_pose
-from turbogs_plugin.yaml_json import parse_json
+from turbogs_plugin.yaml_json import parse_json, require_json_size
 
 FILE, TRAIN_FILE = "transforms.json", "transforms_train.json"
 TEST_FILES = ("transforms_test.json", "transforms_val.json")
@@ -70,6 +70,7 @@ def read_blender(scene: Path) -> Capture:
 def read_frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """A transforms file and its frames under a key, without null and empty texts, which other writers have for what is
     absent. Raises `InputError` unless it is JSON with a list of frames."""
+    require_json_size(source)
     content = parse_json(text_of(source), str(source))
     frames = content.get(key) if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from turbogs_plugin.commands.options import Count, Device, Overrides, Scene
+from turbogs_plugin.commands.options import Count, Device, Overrides, require_positive
 from turbogs_plugin.errors import InputError
 
 
@@ -16,7 +16,7 @@ def bench(
     overrides: Overrides = (),
     /,
     *,
-    scene: Scene = None,
+    scene: Annotated[Path, arg(metavar="SCENE")],
     ply: Annotated[Path | None, arg(metavar="MODEL.ply")] = None,
     gaussians: Annotated[tuple[int, ...], arg(metavar="M ...")] = (150_000, 600_000),
     views: Annotated[tuple[int, ...], arg(metavar="K ...")] = (10, 5, 3),
@@ -26,12 +26,11 @@ def bench(
 ) -> int:
     """Time an iteration of training, the rasterizer, or the whole `turbogs train`.
 
-    All three need --scene; step and raster need a model of it, too: turbogs train SCENE --out RUN writes RUN/model.ply.
+    Step and raster need a model of the scene, too: turbogs train SCENE --out RUN writes RUN/model.ply.
 
     Args:
-        what: step: an iteration from sampling to update, step by step beside what memory and arithmetic allow. raster:
-            forward and backward pass stage by stage, beside gsplat's dense ones. wall: the command itself by the clock
-            on the wall, part by part.
+        what: step: an iteration, step by step beside what memory and arithmetic allow. raster: both passes, stage by
+            stage beside gsplat's dense ones. wall: the command itself by the clock on the wall, part by part.
         overrides: changes of the configuration that is timed, e.g. scene.factor=2.
         scene: folder of the capture.
         ply: step, raster: the trained model to time, so that several builds time the same.
@@ -47,10 +46,7 @@ def bench(
 
     times = repeats if repeats is not None else 3 if what == "wall" else 100
     for name, values in {"gaussians": gaussians, "views": views, "repeats": (times,)}.items():
-        if not values or min(values) < 1:
-            raise InputError(f"--{name} {' '.join(map(str, values))}: each must be at least 1")
-    if scene is None:
-        raise InputError(f"bench {what} needs --scene SCENE")
+        require_positive(f"--{name}", *(values or (0,)))
     where = resolve_device(device)
     jobs.require_result_file(out)
     if what == "wall":

@@ -71,29 +71,24 @@ def render(
         split: which cameras.
         depth: also write depth images: .npy (float32, along the camera's axis, in the capture's own units; 0 where
             nothing was hit) and .png (near is bright).
-        out: folder for the pictures; renders in the run's folder where absent. With --path the new file of the film
-            (.mp4).
+        out: folder for the pictures; renders in the run's folder where absent. With --path the film's new file (.mp4).
         path: write a film of 60 frames a second along a path: orbit, about what the capture shows; views, through its
             training cameras; or a file of cameras: transforms.json's layout, nerfstudio's path, Inria's cameras.json.
         seconds: of the film; 10 where absent.
         device: where to render.
     """
-    if path is not None:
-        from turbogs_plugin.export.renders import film_run
+    from turbogs_plugin.export.renders import film_run, render_run
 
+    settings = given.settings(overrides)
+    if path is None:
+        if seconds is not None:
+            raise InputError("--seconds is the length of a film: give --path and --out FILE.mp4, too")
+        folders = render_run(run, split, device, depth, settings, out)
+        print("\n".join(f"{name:<8} {folder}" for name, folder in zip(("renders", "depths"), folders, strict=False)))
+    else:
         if depth or split != "test" or out is None:
             raise InputError("--path writes a film: it takes --out FILE.mp4 and --seconds, not --split or --depth")
-        length = 10.0 if seconds is None else seconds
-        print(f"film   {film_run(run, path, out, length, device, given.settings(overrides))}")
-        return 0
-    if seconds is not None:
-        raise InputError("--seconds is the length of a film: give --path and --out FILE.mp4, too")
-
-    from turbogs_plugin.export.renders import render_run
-
-    folders = render_run(run, split, device, depth, given.settings(overrides), out)
-    for name, folder in zip(("renders", "depths"), folders, strict=False):
-        print(f"{name:<8} {folder}")
+        print(f"film   {film_run(run, path, out, 10.0 if seconds is None else seconds, device, settings)}")
     return 0
 
 
@@ -116,9 +111,8 @@ def export(
         overrides: with --scene, as in eval.
         format: ply: as the original 3DGS writes it, which viewers read. pt: a checkpoint of gsplat's simple_trainer,
             which needs --no-normalize-world-space to take it. spz: smaller, with some loss; spz2: its older version;
-            splat: one colour each.
-            glb: glTF with KHR_gaussian_splatting. usda: OpenUSD's ParticleField3DGaussianSplat.
-            html: a page with the model to turn in a browser, without a network.
+            splat: one colour each. glb: glTF with KHR_gaussian_splatting. usda: OpenUSD's
+            ParticleField3DGaussianSplat. html: a page with the model to turn in a browser, without a network.
         out: new file; export.ply, model.pt, ..., or model.html in the run's folder where absent.
         max_gaussians: largest number of Gaussians; those are kept that add most to the training views.
         cameras: give each photo of a capture a refined camera of its own, and write a capture to train on, with

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -21,7 +19,6 @@ LOCAL, PORT = "127.0.0.1", 8080
 """Where a viewer listens unless told otherwise: for this machine alone."""
 
 Device = Literal["auto", "cpu", "cuda"]
-
 Overrides = Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")]
 Count = Annotated[int | None, arg(metavar="N")]
 Scene = Annotated[Path | None, arg(metavar="SCENE")]
@@ -53,19 +50,17 @@ class RunOptions:
     init: Annotated[str | None, arg(metavar="points|random|MODEL")] = None
 
     def settings(self, scene: Path | None, overrides: tuple[str, ...]) -> Config:
-        """The configuration that a command line asks for. `scene`: None leaves the capture open."""
+        """The configuration that a command line asks for. No scene leaves the capture open."""
         from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
         from turbogs_plugin.plan.memory import with_cap
 
         if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
             raise InputError("scene.path is what SCENE says: leave the override out")
-        if self.max_gaussians is not None and self.max_gaussians < 1:
-            raise InputError(f"--max-gaussians {self.max_gaussians}: it must be at least 1; leave it out for no limit")
+        require_positive("--max-gaussians", self.max_gaussians)
         given = {"scene.factor": self.factor, "train.device": self.device, "train.init": self.init}
         given |= {"budget.max_memory": self.max_memory, "budget.time": self.time_budget}
         more = [f"{name}={json.dumps(value)}" for name, value in given.items() if value is not None]
-        asked = DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *more)
-        settings = load_config(*asked)
+        settings = load_config(DEFAULT_CONFIG if self.config is None else self.config, (*overrides, *more))
         if self.max_gaussians is not None:
             settings = with_cap(settings, self.max_gaussians)
         if scene is not None:
@@ -105,11 +100,7 @@ Given = Annotated[GivenOptions, arg(name="")]
 NO_SCENE = GivenOptions()
 
 
-def is_change(scene: Path) -> bool:
-    """Whether the word in the place of a capture is a change of the configuration."""
-    return re.fullmatch(r"\w+(\.\w+)+=.*", str(scene), re.DOTALL) is not None and not scene.exists()
-
-
-def require_positive(option: str, values: Sequence[float]) -> None:
-    if not all(0 < value < math.inf for value in values):
-        raise InputError(f"{option} {' '.join(map(str, values))}: it must be more than 0 and finite")
+def require_positive(option: str, *values: float | None) -> None:
+    """Raise `InputError` unless the values of an option, where there are any, are all above 0."""
+    if not all(value is None or 0 < value < math.inf for value in values):
+        raise InputError(f"{option} {' '.join(map(str, values))}: it must be above 0 and finite, or left out")

@@ -27,17 +27,11 @@ def help_text(commands: Mapping[str, Command]) -> str:
 
 
 def parsed(commands: Mapping[str, Command], words: Sequence[str]) -> Callable[[], int]:
-    """The call that a command line asks for. `--help` after a command prints its options and leaves.
+    """The call that a command line asks for: a verb of the commands first. `--help` after it prints its options and
+    leaves. Raises `InputError` for words that no command takes.
 
     Changes of the configuration, where a command takes them, may stand anywhere: tyro leaves over those behind an
     option, and they are added to the others.
-
-    Args:
-        commands: verb -> function.
-        words: words after the program's name, the verb first.
-
-    Raises:
-        InputError: words that no command takes.
     """
     verb, *rest = words
     if verb not in commands:
@@ -86,22 +80,17 @@ def _unknown_option(function: Command, words: Sequence[str]) -> str:
             known |= {entry.name for entry in fields(parameter.default)}
         elif parameter.kind is Parameter.KEYWORD_ONLY:
             known |= {name, f"no_{name}"} if isinstance(parameter.default, bool) else {name}
-    for number, word in enumerate(words):
+    for word, behind in zip(words, (*words[1:], ""), strict=False):
         option, equals, value = word.partition("=")
         name = option[2:].replace("-", "_")
         if not option.startswith("--") or name in known:
             continue
-        sections: Mapping[str, Any] = {}
+        remedy = nearest(option, (f"--{entry.replace('_', '-')}" for entry in known))
         if "overrides" in signature(function).parameters:
             from turbogs_plugin.config.configuration import load_config
 
-            sections = load_config("turbogs").to_mapping()
-        value = value if equals else "".join(words[number + 1 : number + 2])
-        settings = [f"{section}.{name}={value}" for section, values in sections.items() if name in values]
-        remedy = (
-            f"write {' or '.join(settings)}"
-            if settings
-            else nearest(option, (f"--{entry.replace('_', '-')}" for entry in known))
-        )
+            sections = load_config("turbogs").to_mapping().items()
+            settings = [f"{section}.{name}={value if equals else behind}" for section, keys in sections if name in keys]
+            remedy = f"write {' or '.join(settings)}" if settings else remedy
         return f"there is no {option}: {remedy}"
     return ""

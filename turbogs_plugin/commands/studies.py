@@ -7,13 +7,13 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from turbogs_plugin.commands.options import Count, Device, require_positive
+from turbogs_plugin.commands.options import Count, Device, Overrides, require_positive
 from turbogs_plugin.errors import InputError
 
 
 def ablate(
     name: Annotated[Positional[str], arg(metavar="NAME_OR_FILE")],
-    overrides: Annotated[Positional[tuple[str, ...]], arg(metavar="[section.key=value ...]")] = (),
+    overrides: Overrides = (),
     /,
     *,
     out: Path,
@@ -43,8 +43,8 @@ def ablate(
 
     if not scene:
         raise InputError("ablate needs --scene SCENE: the folder of a capture")
-    for option, count in (("--steps", steps), ("--gpus", gpus)):
-        require_positive(option, () if count is None else (count,))
+    require_positive("--steps", steps)
+    require_positive("--gpus", gpus)
     choice = CellChoice(scene, seeds, only, overrides, steps, device)
     failures = run_study(load_ablation(name), choice, out, gpus)
     for failure in failures:
@@ -63,7 +63,7 @@ def report(
     were asked the same, but for the seed, count as one variant.
 
     Args:
-        paths: folders of studies; or folders of two runs or more, the first of which the others are compared with.
+        paths: folders of studies; or of two runs or more, the first of which the others are compared with.
         out: new folder for the report of runs.
         psnr: test PSNRs whose time is asked for; from the baseline's result where absent.
     """
@@ -71,18 +71,16 @@ def report(
     from turbogs_plugin.study.runs import study_of_runs
     from turbogs_plugin.study.study_report import write_report
 
-    require_positive("--psnr", psnr)
+    require_positive("--psnr", *psnr)
     if not paths:
         raise InputError("report needs STUDY ..., folders of studies, or RUN RUN ... --out NEW, folders of runs")
-    folders = [StudyFolder(path) for path in paths]
     if out is not None:
         if len(paths) < 2:
             raise InputError("report --out compares runs: give it the folders of two runs or more")
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise InputError(f"--out '{out}' is there and not empty: choose a new folder")
-        folders = [StudyFolder(out)]
-        folders[0].write_study(study_of_runs(paths))
-    for folder in folders:
+        StudyFolder(out).write_study(study_of_runs(paths))
+    for folder in map(StudyFolder, paths if out is None else (out,)):
         if not folder.read_study().results:
             raise InputError(f"'{folder.path}' has no finished cells to report on: go on with turbogs ablate")
         print(f"report  {write_report(folder, psnr)}")

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import gc
+import re
 import shlex
 import sys
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from turbogs_plugin.commands.options import LOCAL, NO_OPTIONS, PORT, Count, Flat, Overrides, Scene, is_change
+from turbogs_plugin.commands.options import LOCAL, NO_OPTIONS, PORT, Count, Flat, Overrides, Scene, require_positive
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.train.clock import WallClock
 
@@ -46,8 +46,7 @@ def train(
         out: new folder for the run.
         resume: folder of a stopped run to go on with, by its own configuration.
         report: at the end, write the report and its pictures; --no-report leaves model, history and checkpoints.
-        viewer: show the training in a browser, at this port (8080 where none is named); afterwards its model, until
-            Ctrl-C.
+        viewer: show the training in a browser, at this port (or 8080); afterwards its model, until Ctrl-C.
         viewer_host: address where the viewer listens; 0.0.0.0 lets others on the network look, and pause the training.
         gpus: number of this machine's GPUs that train one model, a process each; torchrun does the same on several
             machines. docs/scaling.md says what they gain.
@@ -58,16 +57,13 @@ def train(
         raise InputError("--viewer-host says where a viewer listens: give --viewer, too")
     if resume is not None:
         if scene or overrides or out or options != NO_OPTIONS:
-            raise InputError(
-                "--resume goes on by the run's own configuration: give it nothing else but --no-report, --viewer, "
-                "--gpus and --trust"
-            )
+            others = "--no-report, --viewer, --gpus and --trust"
+            raise InputError(f"--resume goes on by the run's own configuration: give it nothing else but {others}")
     elif scene is None or out is None:
         raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
     elif trust:
         raise InputError("--trust is for --resume: a configuration that you name yourself is your own word")
-    if gpus is not None and gpus < 1:
-        raise InputError(f"--gpus {gpus}: it must be at least 1")
+    require_positive("--gpus", gpus)
     if viewer is not None and (gpus or 1) > 1:
         raise InputError(VIEWER_ON_ONE)
     from turbogs_plugin.distributed.processes import joined, launched, restarts, start
@@ -76,18 +72,19 @@ def train(
     from turbogs_plugin.train import run
 
     gc.freeze()  # collections during training pass over the imports' objects
-    settings = options.settings(scene, overrides) if resume is None else run.RunFolder(resume).read_config()
-    if resume and viewer is None and run.RunFolder(resume).finished(report):
-        print(f"{resume} is finished: its model is {run.RunFolder(resume).model}")
+    target = resume or out
+    assert target is not None  # one of them is named
+    folder = run.RunFolder(target)
+    settings = options.settings(scene, overrides) if resume is None else folder.read_config()
+    if resume and viewer is None and folder.finished(report):
+        print(f"{resume} is finished: its model is {folder.model}")
         return 0
     if gpus is not None and gpus > 1 and not launched():
-        if out is not None:
-            run.RunFolder(out).require_new()
+        if resume is None:
+            folder.require_new()
         return start(gpus, sys.argv[1:], settings.train.device)
     page, watch = write_report if report else None, event_writers(settings)
     with joined(settings.train.device) as ranks, ExitStack() as pages:
-        if out is not None and restarts() and run.RunFolder(out).config.is_file():
-            resume, trust = out, True  # the configuration is this command's own
         live = None
         if viewer is not None:
             if ranks.count > 1:
@@ -98,10 +95,10 @@ def train(
             live = LiveViewer(Page(viewer_host, viewer[0] if viewer else PORT, training=True))
             pages.callback(live.page.close)
             watch.append(live.watch)
-        folder = resume or out
-        assert folder is not None  # one of them is named
-        begin = partial(run.resume, folder, trusted=trust) if resume else partial(run.train, settings, folder)
-        session = begin(page, clock, ranks, watch)
+        if resume is None and not (restarts() and folder.config.is_file()):
+            session = run.train(settings, target, page, clock, ranks, watch)
+        else:  # a configuration that this command has written itself is trusted
+            session = run.resume(target, page, clock, ranks, watch, trust or resume is None)
         code = _tell(session, report) if ranks.first else 128 + session.signal if session.signal else 0
         if live is not None and session.signal is None:
             live.stay()
@@ -109,12 +106,7 @@ def train(
 
 
 def plan(
-    scene: Positional[Scene] = None,
-    overrides: Overrides = (),
-    /,
-    *,
-    gpus: Count = None,
-    options: Flat = NO_OPTIONS,
+    scene: Positional[Scene] = None, overrides: Overrides = (), /, *, gpus: Count = None, options: Flat = NO_OPTIONS
 ) -> int:
     """Print what a run on a capture would decide, and why, without training; without a SCENE, every setting.
 
@@ -123,8 +115,8 @@ def plan(
         overrides: changes as in train; train.exposure=auto leaves a setting to the plan, any other value forces it.
         gpus: number of GPUs that would train the model.
     """
-    if scene is not None and is_change(scene):
-        scene, overrides = None, (str(scene), *overrides)
+    if scene is not None and re.fullmatch(r"\w+(\.\w+)+=.*", str(scene), re.DOTALL) and not scene.exists():
+        scene, overrides = None, (str(scene), *overrides)  # a change of the configuration, and no capture
     settings = options.settings(scene, overrides)
     if scene is None:
         from turbogs_plugin.config.configuration import settings_text

@@ -36,12 +36,8 @@ def default_type(kind: str) -> str:
 
 
 def strategy_class(kind: str, name: Any) -> type:
-    """The class behind a type's name, or the class ``module:Class`` itself.
-
-    Raises:
-        InputError: an unknown name (naming the nearest and all that are known), one whose module cannot be imported,
-            or one of something else than a dataclass.
-    """
+    """The class behind a type's name, or the class ``module:Class`` itself. Raises `InputError` for an unknown name
+    (naming the nearest and all that are known), a module that cannot be imported, or what is no dataclass."""
     known = {own: f"turbogs_plugin.strategies.{place}" for own, place in TYPES[kind].items()}
     if isinstance(name, str) and ":" in name:
         known = {name: name}
@@ -88,20 +84,15 @@ def foreign_code(mapping: Mapping[str, Any]) -> dict[str, str]:
 
 
 def build(kind: str, mapping: Any) -> Any:
-    """A new strategy from ``{"type": name, **its init fields}``.
-
-    Raises:
-        InputError: an unknown kind, type or key, a wrong type of a value, one out of range, or a class without what
-            its kind's protocol has.
-    """
+    """A new strategy from ``{"type": name, **its init fields}``. Raises `InputError` for an unknown kind, type or key,
+    a wrong type of a value, one out of range, or a class without what its kind's protocol has."""
     if kind not in TYPES:
         raise InputError(f"unknown kind of strategy '{kind}': {nearest(kind, KINDS)}")
     if not isinstance(mapping, Mapping):
         raise InputError(f"{kind}: expected a mapping with a 'type', got {mapping!r}")
     type_name = mapping.get("type", default_type(kind))
     found = strategy_class(kind, type_name)
-    options = {key: value for key, value in mapping.items() if key != "type"}
-    strategy: Any = build_dataclass(found, options, kind)
+    strategy: Any = build_dataclass(found, {key: value for key, value in mapping.items() if key != "type"}, kind)
     # Run-time state counts as present, and no value is read: reading may need `setup`.
     present = {*dir(found), *(field.name for field in fields(strategy))}
     protocol = getattr(protocols, PROTOCOLS[kind])

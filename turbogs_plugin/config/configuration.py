@@ -1,6 +1,6 @@
 """The configuration of a run: dataclasses <- YAML <- dotted overrides.
 
-A YAML has one section a part. The sections `scene`, `train`, `maps`, `raster`, `report` and `budget` hold the settings
+A YAML has one section a part. The sections `scene`, `train`, `maps`, `report` and `budget` hold the settings
 of a dataclass (`SECTION_CLASSES`); a strategy's section holds its ``type`` and the settings of that strategy's own
 dataclass. Defaults live in those dataclasses and nowhere else. ``base: NAME_OR_FILE`` puts a YAML on top of another; a
 file is looked for beside it. The plan of a run decides settings that are ``auto`` (`sections.AUTO_SETTINGS`).
@@ -28,18 +28,14 @@ from turbogs_plugin.config.sections import (
     TrainConfig,
     undecided,
 )
-from turbogs_plugin.config.typed import build_dataclass, dataclass_mapping
-from turbogs_plugin.engine.render_pass import RasterSettings
+from turbogs_plugin.config.typed import build_dataclass, dataclass_mapping, settings_of
+from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
 from turbogs_plugin.errors import InputError, nearest
 from turbogs_plugin.strategies import TYPES
 from turbogs_plugin.yaml_json import packaged_names, parse_yaml, read_named_yaml, yaml_text
 
-PACKAGE = "turbogs_plugin.configs"
-"""Where the packaged configurations are."""
-
-DEFAULT_CONFIG = "turbogs"
-"""The packaged configuration that a run without ``--config`` takes."""
-
+PACKAGE, DEFAULT_CONFIG = "turbogs_plugin.configs", "turbogs"
+"""Where the packaged configurations are, and the one that a run without ``--config`` takes."""
 BASE_DEPTH_LIMIT = 8
 """Most configurations under one another by ``base``."""
 
@@ -57,9 +53,9 @@ class Config:
     density: dict[str, Any]
     optimizer: dict[str, Any]
     maps: MapsConfig
-    raster: RasterSettings
     report: ReportConfig = field(default_factory=ReportConfig)
     budget: BudgetConfig = field(default_factory=BudgetConfig)
+    raster: RasterSettings = field(default=DEFAULT_SETTINGS, metadata={"setting": False})
 
     def build(self, kind: str) -> Any:
         """A new strategy of this kind."""
@@ -67,8 +63,7 @@ class Config:
 
     def require_decided(self) -> None:
         """Raise RuntimeError, an error of the caller's code, where a setting is left to a plan: no run can use it."""
-        left = undecided(self.to_mapping())
-        if left:
+        if left := undecided(self.to_mapping()):
             raise RuntimeError(
                 f"{', '.join(left)}: {AUTO}, but a run goes by what a plan has decided: "
                 "use make_plan(config, scene, device).apply(config), or config.without_plan()"
@@ -76,9 +71,8 @@ class Config:
 
     def without_plan(self) -> Config:
         """This configuration, decided for a run that looks at neither scene nor machine, such as a benchmark."""
-        decided = vars(TrainConfig(pixels_place="device"))  # the defaults
-        left = {name: decided[name] for name in AUTO_SETTINGS if getattr(self.train, name) == AUTO}
-        return self.changed(train=left)
+        defaults = vars(TrainConfig(pixels_place="device"))
+        return self.changed(train={name: defaults[name] for name in AUTO_SETTINGS if getattr(self.train, name) == AUTO})
 
     def changed(self, **sections: Mapping[str, Any]) -> Config:
         """This configuration with values of some sections replaced; a section with a `type` starts afresh."""
@@ -97,7 +91,7 @@ class Config:
 
 
 SECTION_CLASSES: dict[str, type] = {
-    name: hint for name, hint in get_type_hints(Config).items() if isinstance(hint, type) and is_dataclass(hint)
+    name: get_type_hints(Config)[name] for name in settings_of(Config) if is_dataclass(get_type_hints(Config)[name])
 }
 """Section that is no strategy's -> its dataclass."""
 
@@ -108,12 +102,9 @@ def config_names() -> list[str]:
 
 
 def load_config(name_or_file: str = DEFAULT_CONFIG, overrides: Sequence[str] = ()) -> Config:
-    """The configuration of a packaged name or a YAML file, with overrides ``section.key=value`` on top.
-
-    Raises:
-        InputError: an unknown name, an unreadable file, an unknown key or type (naming the nearest), a wrong type of
-            a value, or one out of range.
-    """
+    """The configuration of a packaged name or a YAML file, with overrides ``section.key=value`` on top. Raises
+    `InputError` for an unknown name, an unreadable file, an unknown key or type (naming the nearest), a wrong type of a
+    value, or one out of range."""
     return resolve(apply_overrides(_load_mapping(name_or_file), overrides))
 
 
@@ -132,11 +123,8 @@ def settings_text(config: Config) -> str:
 
 
 def resolve(mapping: Mapping[str, Any], built: bool = True) -> Config:
-    """The complete, checked configuration of a mapping of sections; absent sections have their defaults.
-
-    Args:
-        built: whether strategies are built, which imports and checks them; else their sections are taken as they are.
-    """
+    """The complete, checked configuration of a mapping of sections; absent sections have their defaults. Strategies are
+    `built`, which imports and checks them; else their sections are taken as they are."""
     for section in mapping:
         if section not in SECTION_CLASSES and section not in KINDS:
             raise InputError(f"unknown section '{section}': {nearest(section, [*SECTION_CLASSES, *KINDS])}")
@@ -154,17 +142,15 @@ def resolve(mapping: Mapping[str, Any], built: bool = True) -> Config:
 def resolve_complete(
     mapping: Mapping[str, Any], where: str, decided: bool = False, built: bool = False, trusted: bool = False
 ) -> Config:
-    """`resolve` of the mapping that a run has written.
+    """`resolve` of the mapping that a run has written to the file `where`.
 
     Args:
-        where: the file, for messages.
         decided: whether nothing may be left to a plan.
         built: as for `resolve`; only a training uses strategies.
         trusted: whether code may run that nobody installed. A line on stderr names its files.
 
     Raises:
-        InputError: a part of it is missing or, where that is asked for, left to a plan; or it names code that is not
-            installed.
+        InputError: a part is missing or, unless allowed, left to a plan or code that is not installed.
     """
     foreign = foreign_code(mapping) if built else {}
     for what, file in foreign.items():

@@ -14,17 +14,23 @@ what a reset of opacities takes away grows back at the rate of the optimizer, ho
 
 SHORTEST_INTERVAL = 10
 """Shortest interval of density control that scaling makes: its statistics need a window of some iterations."""
-
 REGROWTH = 50
 """Iterations in which opacities grow back what an event of density control takes; an event that comes sooner takes
 less."""
+BATCH_FIELDS = ("min_views", "max_views", "views", "pixel_budget")
+"""Settings of a schedule that grow with the batch."""
+RATE_EXPONENT = 0.5
+"""Learning rates grow with this power of the batch. Where a gradient is mostly noise, Adam's step has the length of its
+rate whatever the batch, and n small steps go as far as one that is sqrt(n) times as long (Malladi et al. 2022; for
+Gaussians: Grendel, Zhao et al. 2024)."""
+MOMENT_FIELDS = ("beta1", "beta2")
+"""Decays of an optimizer's moments, raised to the power of the batch: moments then forget after a number of samples,
+not of iterations (Grendel)."""
 
 
 def with_iterations(config: Config, iterations: int) -> Config:
-    """The configuration for a run of exactly this length, with everything scaled that counts iterations.
-
-    Intervals of density control stay at `SHORTEST_INTERVAL` or above; 0 stays 0.
-    """
+    """The configuration for a run of exactly this length, with everything scaled that counts iterations. Intervals of
+    density control stay at `SHORTEST_INTERVAL` or above; 0 stays 0."""
     mapping, factor = config.to_mapping(), iterations / config.train.written_iterations
     density = mapping["density"]
     interval = density.get("refine_every", REGROWTH)
@@ -35,30 +41,15 @@ def with_iterations(config: Config, iterations: int) -> Config:
                 least = min(value, SHORTEST_INTERVAL) if section == "density" else 1
                 mapping[section][name] = max(least, round(value * factor))
     mapping["train"]["iterations"] = iterations
-    if density.get("opacity_decay", 0.0):
-        density["opacity_decay"] = decay_at(density["opacity_decay"], interval, density.get("refine_every", REGROWTH))
+    before, after = min(REGROWTH, interval), min(REGROWTH, density.get("refine_every", REGROWTH))
+    if density.get("opacity_decay", 0.0) and before != after:
+        density["opacity_decay"] = 1.0 - (1.0 - density["opacity_decay"]) ** (after / before)
     return resolve(mapping)
 
 
-BATCH_FIELDS = ("min_views", "max_views", "views", "pixel_budget")
-"""Settings of a schedule that grow with the batch."""
-
-RATE_EXPONENT = 0.5
-"""Learning rates grow with this power of the batch. Where a gradient is mostly noise, Adam's step has the length of its
-rate whatever the batch, and n small steps go as far as one that is sqrt(n) times as long (Malladi et al. 2022; for
-Gaussians: Grendel, Zhao et al. 2024)."""
-
-MOMENT_FIELDS = ("beta1", "beta2")
-"""Decays of an optimizer's moments, raised to the power of the batch: moments then forget after a number of samples,
-not of iterations (Grendel)."""
-
-
 def with_batch_for(config: Config, processes: int) -> Config:
-    """The configuration for `processes` that train together, from one whose batch is written for one process.
-
-    Views and pixels of an iteration are multiplied by the number of processes, learning rates by its root; moments
-    forget after an unchanged number of samples.
-    """
+    """The configuration for `processes` that train together, from one whose batch is written for one process: views and
+    pixels of an iteration grow by their number, learning rates by its root."""
     mapping = config.to_mapping()
     schedule, optimizer = mapping["schedule"], mapping["optimizer"]
     for name in set(BATCH_FIELDS) & set(schedule):
@@ -72,9 +63,3 @@ def with_batch_for(config: Config, processes: int) -> Config:
             rates["written_for"] = rates.get("written_for", 0) // processes  # a larger batch takes fewer iterations
     mapping["train"]["batch_for"] = processes
     return resolve(mapping)
-
-
-def decay_at(decay: float, interval: int, other: int) -> float:
-    """Share of the opacities that events `other` iterations apart take where events `interval` apart take `decay`."""
-    before, after = min(REGROWTH, interval), min(REGROWTH, other)
-    return decay if before == after else 1.0 - (1.0 - decay) ** (after / before)

@@ -17,19 +17,14 @@ from turbogs_plugin.types import Color
 AUTO = "auto"
 """A value that leaves the setting to the plan of a run, which looks at scene and machine (`turbogs_plugin.plan`)."""
 
+Auto = Literal["auto"]
 LONGEST_TIME = 100 * 3600.0
 """Most seconds of a time budget: iterations of 0.2 ms that fit are still fewer than 2^31."""
-
-Auto = Literal["auto"]
-"""The type of `AUTO`."""
-
 AUTO_SETTINGS = ("backdrop", "background", "exposure", "dropout", "batch_for", "iterations", "pixels_place")
 """Settings of the section `train` that may be ``auto``; what a plan makes of it: `turbogs_plugin.plan.decisions`.
 `device` is not among them, as a plan is made for a given device."""
-
 STRIPS = 8
 """Test views that a report, and TensorBoard, show as pictures, at most."""
-
 WRITTEN_FOR = 5000
 """Iterations for which the settings that count iterations are written where `train.iterations` is ``auto``."""
 
@@ -148,17 +143,16 @@ class TrainConfig:
         require(self.refine_until >= 0, "refine_until", self.refine_until, "at least 0")
         require(0 <= self.seed < 2**31, "seed", self.seed, "within 0 .. 2^31 - 1")
         require(self.device in ("auto", "cpu", "cuda"), "device", self.device, "auto, cpu or cuda")
-        named = bool(self.init.strip())
-        require(named, "init", self.init, "points, random, or the file of a model (.ply, .pt) or a run's folder")
+        allowed = "points, random, or the file of a model (.ply, .pt) or a run's folder"
+        require(bool(self.init.strip()), "init", self.init, allowed)
         require(0 <= self.sh_degree <= 3, "sh_degree", self.sh_degree, "within 0 .. 3")
         if self.background not in ("auto", "random"):
             parse_color(self.background)
         require(self.sh_interval >= 1, "sh_interval", self.sh_interval, "at least 1")
         require(0 < self.initial_opacity < 1, "initial_opacity", self.initial_opacity, "more than 0 and less than 1")
         require(0 < self.initial_size <= 100, "initial_size", self.initial_size, "more than 0 and at most 100")
-        require(
-            isinstance(self.dropout, str) or 0 <= self.dropout < 1, "dropout", self.dropout, "at least 0, less than 1"
-        )
+        share = isinstance(self.dropout, str) or 0 <= self.dropout < 1
+        require(share, "dropout", self.dropout, "at least 0, less than 1")
         require_not_negative(self, "distant_size")
         require(0 <= self.average_last <= 1, "average_last", self.average_last, "within 0 .. 1")
         for value in self.evaluate_at:
@@ -182,11 +176,7 @@ class TrainConfig:
 
 @dataclass
 class MapsConfig:
-    """The error maps.
-
-    Args:
-        beta: weight of a new error in the moving average of the errors at its pixel.
-    """
+    """The error maps. `beta`: weight of a new error in the moving average of the errors at its pixel."""
 
     beta: float = 0.4
 
@@ -196,12 +186,8 @@ class MapsConfig:
 
 @dataclass
 class ReportConfig:
-    """The report.
-
-    Args:
-        tensorboard: also write the history and pictures of test views for TensorBoard, into the run's folder at each
-            evaluation; needs the extra ``tensorboard``.
-    """
+    """The report. `tensorboard`: also write history and pictures of test views for TensorBoard, into the run's folder
+    at each evaluation; needs the extra ``tensorboard``."""
 
     tensorboard: bool = False
 
@@ -219,15 +205,15 @@ class BudgetConfig:
     time: str = ""
 
     def __post_init__(self) -> None:
-        self.memory_bytes()
+        self.memory_bytes()  # which raises `InputError` where it is no amount
         require((self.seconds() or 0.0) <= LONGEST_TIME, "time", self.time, "at most 100h")
 
     def memory_bytes(self) -> int | None:
-        """`max_memory`, or None for no limit. Raises `InputError` where it is no amount."""
+        """`max_memory`, or None for no limit."""
         return parse_bytes(self.max_memory) if self.max_memory else None
 
     def seconds(self) -> float | None:
-        """`time`, or None for no limit. Raises `InputError` where it is no amount."""
+        """`time`, or None for no limit."""
         return parse_seconds(self.time) if self.time else None
 
 
@@ -236,18 +222,16 @@ def undecided(mapping: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return [f"train.{name}" for name in AUTO_SETTINGS if mapping["train"][name] == AUTO]
 
 
-BYTE_UNITS = {"": 1, "b": 1, "kib": 2**10, "mib": 2**20, "gib": 2**30, "kb": 10**3, "mb": 10**6, "gb": 10**9}
-SECOND_UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
-
-
 def parse_bytes(text: str) -> int:
     """``2GiB``, ``1500 MB``, ``300000000``. Raises `InputError`."""
-    return int(_parse(text, BYTE_UNITS, 1.0, "memory: write 2GiB, 1500MB or a number of bytes"))
+    units = {"": 1, "b": 1, "kib": 2**10, "mib": 2**20, "gib": 2**30, "kb": 10**3, "mb": 10**6, "gb": 10**9}
+    return int(_parse(text, units, 1.0, "memory: write 2GiB, 1500MB or a number of bytes"))
 
 
 def parse_seconds(text: str) -> float:
     """``20s``, ``2m``, ``1.5h``, ``20``. Raises `InputError`."""
-    return _parse(text, SECOND_UNITS, 1e-9, "time: write 20s, 2m or 1.5h")
+    units = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+    return _parse(text, units, 1e-9, "time: write 20s, 2m or 1.5h")
 
 
 def parse_color(text: str) -> Color:

@@ -30,16 +30,12 @@ def settings_of(cls: type) -> dict[str, Field[Any]]:
 
 
 def build_dataclass(cls: type[T], mapping: Any, where: str) -> T:
-    """An instance of dataclass `cls` from a mapping of its settings; those not named keep their defaults.
-
-    Args:
-        cls: a dataclass with resolvable type hints.
-        mapping: plain YAML values; nested dataclasses are nested mappings.
-        where: dotted place, for messages.
+    """An instance of dataclass `cls` from a mapping of its settings as plain YAML values, nested dataclasses as nested
+    mappings; those not named keep their defaults. `where` is the dotted place, for messages.
 
     Raises:
-        InputError: an unknown key (naming the nearest), a missing one, a wrong type, or a value that the
-            dataclass itself refuses.
+        InputError: an unknown key (naming the nearest), a missing one, a wrong type, or a value that the dataclass
+            itself refuses.
     """
     if not isinstance(mapping, Mapping):
         raise InputError(f"{where}: expected a mapping of keys, got {mapping!r}")
@@ -80,13 +76,10 @@ def _plain(value: Any) -> Any:
 
 
 def convert(value: Any, hint: Any, where: str) -> Any:
-    """`value` as the type that a hint asks for.
+    """`value` as the type that a hint asks for. Raises `InputError` where it is of another type.
 
     A whole number becomes a float where one is asked for, and ``5e3`` an integer; nothing else changes its type. A hint
     that is no YAML type is not checked here: the dataclass checks such a field itself.
-
-    Raises:
-        InputError: `value` is of another type.
     """
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     number = isinstance(value, int | float) and not isinstance(value, bool)
@@ -101,15 +94,11 @@ def convert(value: Any, hint: Any, where: str) -> Any:
             return origin(convert(item, arguments[0], f"{where}[{place}]") for place, item in enumerate(value))
     elif origin is dict:
         if isinstance(value, Mapping):
-            return {
-                convert(key, str, where): convert(item, arguments[1], f"{where}.{key}") for key, item in value.items()
-            }
-    elif hint is float:
-        if number and not math.isnan(value):
-            return float(value)
-    elif hint is int:
-        if number and math.isfinite(value) and value == int(value):
-            return int(value)
+            items = value.items()
+            return {convert(key, str, where): convert(item, arguments[1], f"{where}.{key}") for key, item in items}
+    elif hint in (float, int):
+        if number and not math.isnan(value) and (hint is float or (math.isfinite(value) and value == int(value))):
+            return hint(value)
     elif origin is Literal:
         if value in arguments:
             return value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import torch
@@ -147,7 +147,7 @@ class RasterSettings:
         eps2d: blur, added to the diagonal of the projected covariance, pixels squared; 0 or more.
         near_plane, far_plane: depths outside are not drawn, world units; near_plane above 0.
         transmittance_min: transmittance of a pixel that ends it, before the splat that would bring it to this or below;
-            between 0 and 1. The only one that a configuration sets.
+            between 0 and 1.
 
     Attributes:
         alpha_min: a splat with less opacity at a pixel is skipped there.
@@ -157,9 +157,9 @@ class RasterSettings:
         InputError: a value outside these bounds.
     """
 
-    eps2d: float = field(default=0.3, metadata={"setting": False})
-    near_plane: float = field(default=0.01, metadata={"setting": False})
-    far_plane: float = field(default=1e10, metadata={"setting": False})
+    eps2d: float = 0.3
+    near_plane: float = 0.01
+    far_plane: float = 1e10
     transmittance_min: float = 1e-4
     alpha_min: ClassVar[float] = 1.0 / 255.0
     alpha_max: ClassVar[float] = 0.999

@@ -60,14 +60,8 @@ Verdict = tuple[Value, str]
 
 @dataclass(frozen=True)
 class Decision:
-    """One line of a plan.
-
-    Args:
-        setting: name of a field of the section `train`.
-        value: in the run.
-        made: ``auto`` by the facts, or ``set`` by the configuration.
-        reason: by the facts; for what is set, with the value that they would have led to.
-    """
+    """One line of a plan: a field of the section `train`, its value in the run, whether it is ``auto`` by the facts or
+    ``set`` by the configuration, and the reason; for what is set, with the value that the facts would have led to."""
 
     setting: str
     value: Value
@@ -88,7 +82,7 @@ def yaml_text(value: Value) -> str:
 
 
 def wanted_background(facts: SceneFacts, config: Config) -> Verdict:
-    """One that no model can imitate, where photos say what is empty."""
+    """A background that no model can imitate, where photos say what is empty."""
     if facts.transparent:
         return "random", "photos are transparent: what is empty in them stays empty"
     return "black", "photos are opaque"
@@ -98,11 +92,12 @@ def wanted_backdrop(facts: SceneFacts, config: Config) -> Verdict:
     """A far sphere behind the scene, where all cameras look the same way and much of it is seen by few."""
     if config.train.starts_from_model:
         return False, "train.init names a model, which is taken as it is"
-    concentration, cap = facts.direction_concentration, cap_of(config)
+    cap, one_sided = cap_of(config), facts.direction_concentration >= ONE_SIDED
     if 0 < cap <= BACKDROP_COUNT:
         return False, f"its {BACKDROP_COUNT} Gaussians leave no room within density.max_gaussians {cap}"
-    one_sided = concentration >= ONE_SIDED
-    return one_sided, f"view directions concentrated to {concentration:.3f} {_sign(one_sided)} {ONE_SIDED}"
+    return one_sided, (
+        f"view directions concentrated to {facts.direction_concentration:.3f} {_sign(one_sided)} {ONE_SIDED}"
+    )
 
 
 def wanted_exposure(facts: SceneFacts, config: Config) -> Verdict:
@@ -110,17 +105,16 @@ def wanted_exposure(facts: SceneFacts, config: Config) -> Verdict:
     after them."""
     if facts.transparent:
         return False, "photos are transparent: their background has no exposure"
-    if facts.exposure_views is None:
+    if facts.gains is None:
         return False, "unless the photos' exposures say otherwise, which only auto compares"
-    if 2 * facts.exposure_views < facts.train_views:
-        return False, f"only {facts.exposure_views} of {facts.train_views} photos could be compared"
-    spread, rest = facts.exposure_spread, facts.exposure_rest
-    differ, told = spread >= EXPOSURE_STOPS, rest <= EXPOSURE_SHARE * spread
-    reason = f"photos {spread:.2f} stops apart {_sign(differ)} {EXPOSURE_STOPS}"
-    if differ:
-        sign = "<=" if told else ">"
-        reason += f", and {rest:.2f} from those before and after {sign} {EXPOSURE_SHARE} of that"
-    return differ and told, reason
+    spread, rest, compared = facts.gains.spread, facts.gains.rest, int(facts.gains.compared.sum())
+    if 2 * compared < facts.train_views:
+        return False, f"only {compared} of {facts.train_views} photos could be compared"
+    if spread < EXPOSURE_STOPS:
+        return False, f"photos {spread:.2f} stops apart < {EXPOSURE_STOPS}"
+    told = rest <= EXPOSURE_SHARE * spread
+    near = f"{rest:.2f} from those before and after {'<=' if told else '>'} {EXPOSURE_SHARE} of that"
+    return told, f"photos {spread:.2f} stops apart >= {EXPOSURE_STOPS}, and {near}"
 
 
 def wanted_dropout(facts: SceneFacts, config: Config) -> Verdict:
@@ -129,56 +123,57 @@ def wanted_dropout(facts: SceneFacts, config: Config) -> Verdict:
     if error is None:
         return 0.0, "no reconstruction says how accurate the cameras are"
     inaccurate = error >= CAMERA_PIXELS
-    reason = f"points {error:.2f} pixels from where photos show them {_sign(inaccurate)} {CAMERA_PIXELS}"
-    return DROPOUT if inaccurate else 0.0, reason
+    sign = _sign(inaccurate)
+    return DROPOUT * inaccurate, f"points {error:.2f} pixels from where photos show them {sign} {CAMERA_PIXELS}"
 
 
 def wanted_batch_for(facts: SceneFacts, config: Config) -> tuple[int, str]:
     """The batch of all processes, as far as that costs no error and an iteration can have as many different views."""
-    count, views = facts.processes, facts.train_views
+    count, there = facts.processes, min(facts.train_views, MAX_VIEWS)
     most = config.schedule.get("max_views", config.schedule.get("views", 0))
     if count == 1 or not most:
         return 1, "one process" if count == 1 else "the schedule has no number of views"
     wanted = min(count, LARGEST_BATCH)
-    fitting = max(1, min(wanted, min(views, MAX_VIEWS) // most))
+    fitting = max(1, min(wanted, there // most))
     if fitting < wanted:
-        return fitting, f"{count} processes, but {fitting + 1} times {most} views > {min(views, MAX_VIEWS)}"
+        return fitting, f"{count} processes, but {fitting + 1} times {most} views > {there}"
     return fitting, f"{count} processes; a batch for {LARGEST_BATCH} costs no error"
 
 
 def wanted_iterations(facts: SceneFacts, config: Config) -> Verdict:
     """As many iterations as `train.epochs` take: error stops falling after epochs, not after iterations."""
-    train, views = config.train, facts.train_views
+    views = facts.train_views
     # A batch that is set is in the schedule already.
     factor = wanted_batch_for(facts, config)[0] if config.train.batch_for == AUTO else 1
-    epochs = train.epochs * max(1.0, views / MANY_VIEWS) ** 0.5
+    epochs = config.train.epochs * max(1.0, views / MANY_VIEWS) ** 0.5
     wanted = epochs * views / (factor * images_per_iteration(config, views))
     fewest = SHORTEST_SHARE * WRITTEN_FOR / factor**RATE_EXPONENT
     longest = max(LONGEST / factor, fewest)
-    given = min(max(wanted, fewest), longest)
     reason = f"{epochs:.3g} epochs of {views} training views"
     reason += f", {factor} times the pixels an iteration" if factor > 1 else ""
     if wanted < fewest:
         reason += f" take fewer than {fewest:.0f}, the least"
-    if wanted > longest:
+    elif wanted > longest:
         looks = epochs * longest / wanted
         reason += f" take {wanted:.0f}; at most {longest:.0f}, where a pixel is sampled {looks:.1f} times"
-    return math.ceil(given / 100) * 100, reason
+    return math.ceil(min(max(wanted, fewest), longest) / 100) * 100, reason
 
 
 def wanted_pixels_place(facts: SceneFacts, config: Config) -> Verdict:
     """Photos and maps on the device where they fit into a share of its memory; of a pixel, 3 bytes of photos and 4 of
     maps travel to the device each iteration otherwise, and 4 back."""
-    room = HOST_SHARE * facts.host_bytes
-    in_file = f"{HOST_SHARE:.0%} of {mebibytes(facts.host_bytes)} free on the host: maps in a file"
+    in_file = ""
+    if facts.map_bytes > HOST_SHARE * facts.host_bytes:
+        in_file = f" > {HOST_SHARE:.0%} of {mebibytes(facts.host_bytes)} free on the host: maps in a file"
     if facts.device == "cpu":
-        if facts.map_bytes > room:
-            return "host", f"{mebibytes(facts.map_bytes)} > {in_file}"
+        if in_file:
+            return "host", mebibytes(facts.map_bytes) + in_file
         return "device", "the device is the CPU, whose memory is the host's"
     size = facts.photo_bytes + facts.map_bytes
-    fits = size <= DEVICE_SHARE * facts.device_bytes
-    reason = f"{mebibytes(size)} {'<=' if fits else '>'} {DEVICE_SHARE:.0%} of {mebibytes(facts.device_bytes)}"
-    return "device" if fits else "host", f"{reason}, > {in_file}" if not fits and facts.map_bytes > room else reason
+    share = f"{DEVICE_SHARE:.0%} of {mebibytes(facts.device_bytes)}"
+    if size <= DEVICE_SHARE * facts.device_bytes:
+        return "device", f"{mebibytes(size)} <= {share}"
+    return "host", f"{mebibytes(size)} > {share}" + (f",{in_file}" if in_file else "")
 
 
 def mebibytes(size: int) -> str:
@@ -220,28 +215,17 @@ class Plan:
 
     def text(self) -> str:
         """For a terminal, and ``plan.txt`` of a run: a line a decision."""
-        name = max(len(decision.setting) for decision in self.decisions)
-        value = max(len(yaml_text(decision.value)) for decision in self.decisions)
-        lines = [
-            f"  train.{each.setting:<{name}} {yaml_text(each.value):<{value}}  {each.made:<4}  {each.reason}"
-            for each in self.decisions
-        ]
+        rows = [(each.setting, yaml_text(each.value), each.made, each.reason) for each in self.decisions]
+        names, values = (max(len(row[column]) for row in rows) for column in (0, 1))
+        lines = [f"  train.{name:<{names}} {value:<{values}}  {made:<4}  {why}" for name, value, made, why in rows]
         return "\n".join([f"plan for {self.facts.train_views} training views", *lines])
 
 
 def make_plan(config: Config, scene: Scene, device: torch.device, processes: int = 1) -> Plan:
-    """Look at scene and machine, and decide what the configuration leaves to decide, within its budgets.
-
-    Args:
-        config: what is ``auto`` in it is decided.
-        scene: loaded.
-        device: where training is to be.
-        processes: that will train one model together.
-    """
-    asked = config.train.exposure == AUTO
-    limit = config.budget.memory_bytes()
-    facts = gather_facts(scene, device, memory_limit=limit, processes=processes, with_exposures=asked)
-    return plan_from_facts(facts, config)
+    """Look at a loaded scene and the machine, and decide what is ``auto`` in the configuration, within its budgets, for
+    this number of processes that train one model together on `device`."""
+    limit, asked = config.budget.memory_bytes(), config.train.exposure == AUTO
+    return plan_from_facts(gather_facts(scene, device, limit, processes, asked), config)
 
 
 def plan_from_facts(facts: SceneFacts, config: Config) -> Plan:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
 from turbogs_plugin.device import free_bytes
 from turbogs_plugin.error_maps import MAP_BYTES
-from turbogs_plugin.plan.photo_gains import compare_exposures
+from turbogs_plugin.plan.photo_gains import PhotoGains, compare_exposures
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.host_arrays import free_host_bytes
 from turbogs_plugin.scene.photos import PHOTO_BYTES
@@ -19,19 +19,15 @@ class SceneFacts:
     """Numbers that the plan knows.
 
     Args:
-        train_views: number of training views.
         direction_concentration: norm of the mean unit viewing direction of the training cameras; 1: all look the same
             way, 0: all around.
         photo_bytes: of all photos, training and test.
         map_bytes: of the training views' error and age maps.
-        device: cpu or cuda.
         device_bytes, host_bytes: memory free for this run, on the device at most `budget.max_memory`; on a CPU both are
             the same memory.
         transparent: training photos have an alpha.
-        processes: that will train one model together.
-        exposure_spread, exposure_rest, exposure_views: how far photos differ in brightness and white balance, in stops
-            (`compare_exposures`): all from their mean; each from the photos before and after; and the number of photos
-            compared, None where no setting asks for it.
+        processes: number of those that will train one model together.
+        gains: how far training photos differ in brightness and white balance; None where no setting asks for it.
         reprojection_error: a median in pixels, see `Scene`; None: not known.
     """
 
@@ -44,9 +40,7 @@ class SceneFacts:
     host_bytes: int
     transparent: bool = False
     processes: int = 1
-    exposure_spread: float = 0.0
-    exposure_rest: float = 0.0
-    exposure_views: int | None = None
+    gains: PhotoGains | None = field(default=None, compare=False)
     reprojection_error: float | None = None
 
 
@@ -54,7 +48,6 @@ class SceneFacts:
 def gather_facts(
     scene: Scene,
     device: torch.device,
-    *,
     memory_limit: int | None = None,
     processes: int = 1,
     with_exposures: bool = False,
@@ -63,14 +56,11 @@ def gather_facts(
 
     Args:
         scene: in host memory.
-        device: where training is to be.
         memory_limit: bytes of the device that must not be exceeded.
-        processes: that will train together.
         with_exposures: compare the photos' exposures, which takes longer than all else here.
     """
     views = scene.train
     pixels, test_pixels = (int(part.cameras.sizes.prod(axis=1).sum()) for part in (scene.train, scene.test))
-    gains = compare_exposures(views, scene.points) if with_exposures else None
     host_free = free_host_bytes()
     free = free_bytes(device) if device.type == "cuda" else host_free
     return SceneFacts(
@@ -83,8 +73,6 @@ def gather_facts(
         host_bytes=host_free,
         transparent=views.photos.transparent,
         processes=processes,
-        exposure_spread=gains.spread if gains else 0.0,
-        exposure_rest=gains.rest if gains else 0.0,
-        exposure_views=int(gains.compared.sum()) if gains else None,
+        gains=compare_exposures(views, scene.points) if with_exposures else None,
         reprojection_error=scene.reprojection_error,
     )

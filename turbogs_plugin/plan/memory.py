@@ -48,11 +48,7 @@ def cap_of(config: Config) -> int:
 
 
 def with_cap(config: Config, cap: int) -> Config:
-    """The configuration with this cap.
-
-    Raises:
-        InputError: its density control keeps no cap.
-    """
+    """The configuration with this cap. Raises `InputError` where its density control keeps none."""
     if "max_gaussians" not in config.density:
         kind = config.density["type"]
         raise InputError(f"density.type {kind} keeps no cap on Gaussians: use one of error_driven, mcmc, none")
@@ -93,22 +89,15 @@ class MemoryDemand:
     def of(
         cls, config: Config, train_sizes: np.ndarray, test_sizes: np.ndarray, photo_bytes: int = PHOTO_BYTES
     ) -> MemoryDemand:
-        """The demand of a configuration whose places of maps and photos are decided.
-
-        Args:
-            train_sizes, test_sizes: [V, 2] (width, height) of the training photos, and of the test photos, if any.
-            photo_bytes: bytes of a photo's pixel.
-        """
+        """The demand of a configuration whose places of maps and photos are decided, with photos of these sizes [V, 2]
+        (width, height) to train and test on, and this number of bytes of a photo's pixel."""
         train, test = train_sizes.prod(axis=1), test_sizes.prod(axis=1)
-        pixels, test_pixels = int(train.sum()), int(test.sum())
-        largest = int(max(train.max(), test.max(initial=0)))
-        num_views = len(train)
-        views = most_views(config, num_views)
-        window = SETS * views * largest
-        photos, maps = pixels + test_pixels, pixels
+        photos, maps = int(train.sum() + test.sum()), int(train.sum())
+        largest, views = int(max(train.max(), test.max(initial=0))), most_views(config, len(train))
         if config.train.pixels_place == "host":
-            photos, maps = window + SETS * largest, window
-        samples = math.ceil(most_images(config, num_views) * largest)
+            maps = SETS * views * largest
+            photos = maps + SETS * largest
+        samples = math.ceil(most_images(config, len(train)) * largest)
         numbers = 14 + 3 * ((config.train.sh_degree + 1) ** 2 - 1)
         return cls(
             fixed=photo_bytes * photos + MAP_BYTES * maps + SAMPLE_BYTES * samples + IMAGE_BYTES * largest,
@@ -116,11 +105,8 @@ class MemoryDemand:
         )
 
     def gaussians(self, limit: int) -> int:
-        """Number of Gaussians that fit in `limit` bytes.
-
-        Raises:
-            InputError: fewer than `FEWEST_GAUSSIANS`, naming the limit that fits them.
-        """
+        """Number of Gaussians that fit in `limit` bytes. Raises `InputError` for fewer than `FEWEST_GAUSSIANS`, naming
+        the limit that fits them."""
         count = (limit - self.fixed) // self.per_gaussian
         if count < FEWEST_GAUSSIANS:
             least = self.fixed + FEWEST_GAUSSIANS * self.per_gaussian
@@ -133,11 +119,8 @@ class MemoryDemand:
 
 
 def hold_to_limit(config: Config, device: torch.device) -> None:
-    """Hold torch to the configuration's limit of device memory, if it has one, for the rest of the process.
-
-    Raises:
-        InputError: the device is no GPU.
-    """
+    """Hold torch to the configuration's limit of device memory, if it has one, for the rest of the process. Raises
+    `InputError` where the device is no GPU."""
     limit = config.budget.memory_bytes()
     if limit is not None:
         if device.type != "cuda":
@@ -147,20 +130,16 @@ def hold_to_limit(config: Config, device: torch.device) -> None:
 
 
 def room_note(config: Config, scene: Scene, free: int) -> str:
-    """A line where the initial Gaussians, or as many as the cap allows, take more than the free memory of the device,
-    with the number that fits; empty where they fit, and where a limit of memory is kept instead.
-
-    Args:
-        free: bytes.
-    """
-    demand, cap = _demand(config, scene), cap_of(config)
+    """A line where the initial Gaussians, or as many as the cap allows, take more than the `free` bytes of the device,
+    with the number that fits; empty where they fit, and where a limit of memory is kept instead."""
+    demand, cap, growth = _demand(config, scene), cap_of(config), _growth(config)
     first = 0 if config.train.starts_from_model else min(len(scene.points), cap or len(scene.points))
-    most = int((free - demand.fixed) / demand.per_gaussian / _growth(config))
+    most = int((free - demand.fixed) / demand.per_gaussian / growth)
     if config.budget.memory_bytes() is not None or most >= max(first, cap, FEWEST_GAUSSIANS):
         return ""
     count = first if first > most else max(cap, FEWEST_GAUSSIANS)
     remedy = f"--max-gaussians {most}" if most >= FEWEST_GAUSSIANS else "train.pixels_place=host or a larger --factor"
-    needed = demand.fixed + int(_growth(config) * count) * demand.per_gaussian
+    needed = demand.fixed + int(growth * count) * demand.per_gaussian
     return (
         f"{count:,} Gaussians take {needed / 2**30:.1f} GiB of the GPU, of which {free / 2**30:.1f} GiB are free, as "
         f"estimated: {remedy} would fit"
@@ -174,19 +153,13 @@ def _demand(config: Config, scene: Scene) -> MemoryDemand:
 
 def _growth(config: Config) -> float:
     """Most Gaussians on the way over those of the finished model."""
-    train = config.train
-    return config.build("density").growth_room(Step(0, train.written_iterations, train.refine_until))
+    step = Step(0, config.train.written_iterations, config.train.refine_until)
+    return config.build("density").growth_room(step)
 
 
 def within_memory(config: Config, scene: Scene) -> Config:
-    """The configuration whose largest number of Gaussians fits into its limit of memory, if it has one.
-
-    Args:
-        config: the places of maps and photos are decided in it.
-
-    Raises:
-        InputError: no model fits; the message names the limit that would do.
-    """
+    """The configuration whose largest number of Gaussians fits into its limit of memory, if it has one. The places of
+    maps and photos are decided in it. Raises `InputError` where no model fits, naming the limit that would do."""
     limit = config.budget.memory_bytes()
     if limit is None:
         return config

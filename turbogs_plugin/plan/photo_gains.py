@@ -10,7 +10,7 @@ lines, although the nearest photo is always one of the same line.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from weakref import ReferenceType, ref
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,16 +24,13 @@ POINTS_AT_MOST = 2000
 """3D points examined."""
 NEIGHBOURS, CANDIDATES = 8, 24
 """Cameras that a photo is compared with, and nearest cameras among which they are sought."""
-RADIUS = 2
-"""Radius of a patch, in steps."""
-STEPS = 600
-"""A patch's step is a pixel, or this part of the photo's longer side where that is more."""
+RADIUS, STEPS = 2, 600
+"""Radius of a patch in steps: a step is a pixel, or this part of the photo's longer side where that is more."""
 LIKENESS = 0.85
 """Correlation of two patches' luminance from which on they show the same."""
-FEWEST_MATCHES = 8
-"""Patches in common from which on two photos are compared."""
-TIMES_CHANCE = 3
-"""Factor by which like patches must outnumber like patches of different points."""
+FEWEST_MATCHES, TIMES_CHANCE = 8, 3
+"""Like patches from which on two photos are compared, and the factor by which they outnumber like patches of different
+points."""
 TEXTURE = 0.01
 """Standard deviation of luminance (0 .. 1) below which a patch looks like any other."""
 DARKEST, BRIGHTEST = 0.02, 0.98
@@ -48,7 +45,7 @@ Floats = NDArray[np.floating]
 Integers = NDArray[np.integer]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PhotoGains:
     """Gains of V photos, in stops: factors of 2 of their values, which are gamma-coded as in the file.
 
@@ -66,42 +63,20 @@ class PhotoGains:
     rest: float
 
 
-@dataclass(frozen=True)
-class _Patches:
-    """Patches of one photo that can be compared.
-
-    Args:
-        points: [n] int64, ascending.
-        shapes: [n, 25] float32 luminance, with mean 0 and norm 1.
-        stops: [n, 3] float32, log2 of the mean colours.
-    """
+class _Patches(NamedTuple):
+    """Patches of one photo that can be compared."""
 
     points: Integers
+    """[n] int64, ascending."""
     shapes: Floats
+    """[n, 25] float32 luminance, with mean 0 and norm 1."""
     stops: Floats
-
-
-_latest: tuple[ReferenceType[PosedImages], Tensor, PhotoGains] | None = None
-"""Photos and points that were compared last, and their gains: a plan asks for them, then the training's start."""
+    """[n, 3] float32, log2 of the mean colours."""
 
 
 def compare_exposures(views: PosedImages, points: Tensor) -> PhotoGains:
-    """The gains of photos, by the surface points that they share.
-
-    Where the points are not on surfaces (random ones, for want of better), hardly a patch has a match and hardly a
-    photo is compared.
-
-    Args:
-        points: [M, 3], in the views' frame.
-    """
-    global _latest
-    if _latest is None or _latest[0]() is not views or _latest[1] is not points:
-        _latest = ref(views), points, _compared(views, points)
-    return _latest[2]
-
-
-def _compared(views: PosedImages, points: Tensor) -> PhotoGains:
-    """`compare_exposures` of photos that were not compared last."""
+    """The gains of photos, by the surface points [M, 3] that they share, in the views' frame. Where the points are not
+    on surfaces (random ones, for want of better), hardly a patch has a match and hardly a photo is compared."""
     count = len(views)
     cameras = views.cameras.to("cpu", torch.float64)
     patches = _patches(views, points)
@@ -118,28 +93,20 @@ def _compared(views: PosedImages, points: Tensor) -> PhotoGains:
             found += ratios[pair][1] > 0
             if found == NEIGHBOURS:
                 break
-    kept = {pair: ratio for pair, (ratio, matches) in ratios.items() if matches}
-    pairs = np.array(list(kept), dtype=np.int64).reshape(-1, 2)
-    weights = np.sqrt(np.array([ratios[pair][1] for pair in kept], dtype=np.float64))
-    gains = fit_gains(pairs, np.array(list(kept.values()), dtype=np.float64).reshape(-1, 3), weights, count)
+    kept = [(pair, ratio, matches) for pair, (ratio, matches) in ratios.items() if matches]
+    pairs = np.array([pair for pair, _, _ in kept], dtype=np.int64).reshape(-1, 2)
+    told = np.array([ratio for _, ratio, _ in kept], dtype=np.float64).reshape(-1, 3)
+    gains = fit_gains(pairs, told, np.sqrt([float(matches) for _, _, matches in kept]), count)
     compared = np.bincount(pairs.reshape(-1), minlength=count) > 0  # [V]
-    names = [name for name, told in zip(views.names, compared, strict=True) if told]
+    names = [views.names[view] for view in np.flatnonzero(compared)]
     among, near = gains[compared], neighbours(views.names, names, names)
     rest = among - near.mean(torch.from_numpy(among)).numpy()
     return PhotoGains(gains, compared, _deviation(among), _deviation(rest))
 
 
 def fit_gains(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> Floats:
-    """[V, 3] gains g with the least sum of ``weight * |g[first] - g[second] - ratio|``, about.
-
-    Their mean is 0 in every part of the photos that pairs connect.
-
-    Args:
-        pairs: [E, 2] int64.
-        ratios: [E, 3], in stops.
-        weights: [E] > 0.
-        count: V.
-    """
+    """[V, 3] gains g with the least sum of ``weight * |g[first] - g[second] - ratio|``, about, over pairs [E, 2] with
+    ratios [E, 3], in stops, and weights [E] > 0. Their mean is 0 in every part of the V photos that pairs connect."""
     from scipy.sparse import csr_matrix, diags
     from scipy.sparse.linalg import lsqr
 

@@ -61,13 +61,14 @@ def train_cell(
     """
     lpips, lpips_reason = load_lpips(device)
     clock = WallClock()
-    planned = make_plan(config, scene, device).apply(config)
+    plan = make_plan(config, scene, device)
+    planned = plan.apply(config)
     test = place_views(scene.test, device, planned.train.pixels_place)
     clock.mark("cell")
     if not warm:
         warm_up(planned, scene, test, device)
     clock.mark("warm-up")
-    loop, evaluations = new_loop(planned, scene, device), Evaluations(test)
+    loop, evaluations = new_loop(planned, scene, device, gains=plan.facts.gains), Evaluations(test)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     loop.listeners = [evaluations]

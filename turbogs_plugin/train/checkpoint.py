@@ -21,33 +21,18 @@ from turbogs_plugin.model.torch_file import leaves, read_plain, save_plain
 FORMAT = 2
 KEPT = 2
 """Checkpoints that stay on the disk: the newest and one before it."""
-
 COUNT_LIMIT = 2**31
 """All whole numbers in a state are counts below this, in tensors below half of it."""
-
 CHECKED_AT_ONCE = 2**24
 """Numbers: error maps may be larger than the memory."""
-
-REMEDY = "; train anew with another --out"
-
+REMEDY = "train anew with another --out"
 _NAME = re.compile(r"iteration-(\d{6,})\.pt")
 
 
 def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path:
-    """Write the state of a run and make it the newest one.
-
-    Args:
-        folder: ``checkpoints/`` of the run; made if absent.
-        iteration: finished iterations.
-        state: nested dicts, lists and tuples of tensors, numbers, text, booleans and None.
-
-    Returns:
-        The file.
-
-    Raises:
-        TrainingStopped: the disk refused; the newest checkpoint is the one before.
-        TypeError: something in `state` is not plain.
-    """
+    """Write the state of a run, nested dicts, lists and tuples of tensors and plain values, after this number of
+    iterations, into its folder ``checkpoints/``, and make it the newest one. Raises `TrainingStopped` where the disk
+    refused, and the checkpoint before stays the newest; `TypeError` where something is not plain."""
     for place, value in leaves(state, "state"):
         if type(value) not in (Tensor, int, float, bool, str, type(None)):
             raise TypeError(f"{place}: a checkpoint holds tensors and plain values, not {type(value).__name__}")
@@ -80,13 +65,10 @@ def latest_checkpoint(folder: Path) -> Path | None:
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """The state in a checkpoint, on the CPU.
-
-    Raises:
-        InputError: not a checkpoint of TurboGS, truncated, or with anything but plain tensors and values in it.
-    """
+    """The state in a checkpoint, on the CPU. Raises `InputError` for what is no checkpoint of TurboGS, truncated, or
+    with anything but plain tensors and values in it."""
     others = [file for file in _complete(path.parent) if file.name != path.name]
-    remedy = f"; remove it to go on from {others[-1].name}, or train anew with another --out" if others else REMEDY
+    remedy = f"; remove it to go on from {others[-1].name}, or {REMEDY}" if others else f"; {REMEDY}"
     state = read_plain(path, f"checkpoint '{path}'", remedy)
     if not isinstance(state, dict) or state.pop("format", None) != FORMAT:
         raise InputError(f"checkpoint '{path}' cannot be used: not a checkpoint of this version of TurboGS{remedy}")
@@ -94,15 +76,9 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def require_like(saved: Any, present: Any, place: str) -> None:
-    """Refuse a state whose structure differs from the present one: other keys or types, other dtypes or dimensions of
-    tensors. Numbers that are not finite are refused too.
-
-    The number of rows of a tensor may differ, as it depends on how far the run had come. None instead of a mapping is
-    allowed too: a part without state.
-
-    Raises:
-        ValueError: the message names the place.
-    """
+    """Raise `ValueError`, which names the place, for a state of another structure than the present one: other keys or
+    types, other dtypes or dimensions of tensors; or for numbers that are not finite. The number of rows of a tensor may
+    differ, as it depends on how far the run had come; None may stand for a mapping: a part without state."""
     if present is None or (saved is None and isinstance(present, dict)):
         return
     fits = type(saved) is type(present)

@@ -15,15 +15,12 @@ from turbogs_plugin.yaml_json import parse_json
 
 
 class WallClock:
-    """Seconds on the wall since its making, and what they went into.
-
-    Attributes:
-        parts: name -> seconds that went into it, in the order in which they first ended.
-    """
+    """Seconds on the wall since its making, and what they went into."""
 
     def __init__(self) -> None:
         self._started = self._marked = time.perf_counter()
         self.parts: dict[str, float] = {}
+        """Name -> seconds that went into it, in the order in which they first ended."""
 
     @property
     def seconds(self) -> float:
@@ -39,18 +36,14 @@ class WallClock:
 
 @dataclass
 class WallRecord:
-    """``wall.json`` of a run.
-
-    Args:
-        train_seconds: training, as in the history.
-        wall_seconds: from the start of the command until the model was written or the run was stopped; None for a
-            resumed run, which several commands made.
-        parts: name -> seconds, of the newest command.
-    """
+    """``wall.json`` of a run."""
 
     train_seconds: float
+    """Training, as in the history."""
     wall_seconds: float | None = None
+    """From the start of the command until the model was written or the run stopped; None for a resumed run."""
     parts: dict[str, float] = field(default_factory=dict)
+    """Name -> seconds, of the newest command."""
 
     @staticmethod
     def read(path: Path) -> WallRecord | None:

@@ -47,14 +47,12 @@ class Evaluation(FurtherErrors):
     Args:
         iteration: finished iterations.
         train_seconds: training time until then, without loading, evaluation, checkpoints and report.
-        psnr, ssim, l1: means over the test views; `ssim` is NaN if the images are too small for it.
+        psnr, ssim, l1: means over the test views, as further errors are; `ssim` is NaN if images are too small for it.
         num_gaussians: N.
         memory_bytes: peak of the GPU's tensors, or of the process on a CPU; 0 where it was not kept.
         nonfinite_losses: iterations so far whose loss was not finite.
         skipped_updates: updates of Gaussians skipped so far because their gradient was not finite.
         worst_psnr: PSNR of the worst test view.
-
-    The others are means, too.
     """
 
     iteration: int
@@ -75,22 +73,14 @@ class Evaluation(FurtherErrors):
 
 def append_evaluation(path: Path, evaluation: Evaluation) -> None:
     """Add one line to a history."""
-    with naming(path), open(path, "a", encoding="utf-8", opener=_no_link) as file:
+    with naming(path), open(path, "a", opener=lambda name, flags: os.open(name, flags | os.O_NOFOLLOW, 0o666)) as file:
         file.write(evaluation.to_json() + "\n")
-
-
-def _no_link(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def read_history(path: Path) -> list[Evaluation]:
     """All complete lines of a history; a last line that a killed process or a loss of power cut short is left out.
-
-    Raises:
-        InputError: unreadable, or a line that is not an evaluation.
-    """
-    text = read_text(path) or ""
-    evaluations = []
+    Raises `InputError` where it cannot be read, or a line is not an evaluation."""
+    text, evaluations = read_text(path) or "", []
     lines = text[: text.rfind("\n") + 1].splitlines()
     for number, line in enumerate(lines, start=1):
         if number == len(lines) and not line.endswith("}"):

@@ -20,18 +20,17 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.agreement import require_agreement, unseeing_note
 from turbogs_plugin.train.clock import WallClock
 
-PHOTOS, DEVICE = "photos", "CUDA and kernels, after the photos"
-"""Parts of the wall time in which photos are decoded, and the device is then waited for."""
+DEVICE = "CUDA and kernels, after the photos"
+"""The part of the wall time in which the device is waited for."""
 
 
 def resolve_device(name: str) -> torch.device:
     """The device of ``auto``, ``cpu`` or ``cuda``. Raises `InputError` if CUDA is asked for and absent."""
-    if name == "cuda" and not torch.cuda.is_available():
-        build = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
-        raise InputError(
-            f"CUDA was asked for and is absent ({build}): see 'turbogs doctor', or begin with --device cpu"
-        )
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+    there = name != "cpu" and torch.cuda.is_available()
+    if name == "cuda" and not there:
+        why = "this PyTorch is built without CUDA" if torch.version.cuda is None else "no GPU answers"
+        raise InputError(f"CUDA was asked for and is absent ({why}): see 'turbogs doctor', or begin with --device cpu")
+    return torch.device("cuda" if there else "cpu")
 
 
 def require_device(name: str) -> None:
@@ -73,16 +72,8 @@ def open_started(
     config: Config, clock: WallClock, ranks: Ranks = ONE, trained: bool = False
 ) -> tuple[Scene, torch.device]:
     """The capture, and the device with its kernels loaded: a thread starts it, in a second or more, while photos are
-    decoded.
-
-    Args:
-        clock: of the wall, on which `PHOTOS` and `DEVICE` are marked.
-        ranks, trained: as for `open_scene`. Where one process ends before, the others wait until their launcher
-            ends them.
-
-    Raises:
-        InputError: there is no usable capture, or no such device.
-    """
+    decoded. Both are marked on the clock of the wall. Arguments and errors as of `open_scene`. Where one process ends
+    before, the others wait until their launcher ends them."""
 
     def start() -> torch.device:
         device = resolve_device(config.train.device)
@@ -95,7 +86,7 @@ def open_started(
     with ThreadPoolExecutor(1) as pool:
         started = pool.submit(start)
         scene = open_scene(config.scene, config.train.refine_cameras, ranks, trained)
-        clock.mark(PHOTOS)
+        clock.mark("photos")
         device = started.result()
     clock.mark(DEVICE)
     return scene, device

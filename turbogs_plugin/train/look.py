@@ -17,33 +17,27 @@ from torch import Tensor
 from turbogs_plugin.config.sections import parse_color
 from turbogs_plugin.engine.reference.philox import PURPOSE_BACKGROUND, host_words
 from turbogs_plugin.engine.render_pass import RasterSettings
-from turbogs_plugin.scene.sequence import Neighbours, neighbours
+from turbogs_plugin.scene.sequence import neighbours
 from turbogs_plugin.types import BLACK, WHITE, Color, Step
 
 
 @dataclass(frozen=True)
 class Background:
-    """Meaning of `train.background` for a capture.
-
-    Args:
-        fixed: colour of every iteration; None: a random one each.
-        evaluated: colour of evaluations and pictures.
-    """
+    """Meaning of `train.background` for a capture."""
 
     fixed: Color | None
+    """Colour of every iteration; None: a random one each."""
     evaluated: Color
+    """Colour of evaluations and pictures."""
 
     @classmethod
     def of(cls, setting: str, transparent: bool) -> Background:
-        """The background of a setting.
+        """The background of a setting, beside photos that may be `transparent`. ``auto``, where no plan was made, is
+        ``random`` for these.
 
         No colour of the model can stand for a random background, so what is empty or opaque in the photos becomes so in
-        the model. Evaluations have it as the kind of capture has: transparent photos on white, as published numbers of
-        NeRF-synthetic are, opaque ones on black.
-
-        Args:
-            setting: `train.background`; ``auto``, where no plan was made, is ``random`` for transparent photos.
-            transparent: whether the photos have an alpha.
+        the model. Evaluations then show transparent photos on white, as published numbers of NeRF-synthetic are, opaque
+        ones on black.
         """
         if setting == "random" or (setting == "auto" and transparent):
             return cls(None, WHITE if transparent else BLACK)
@@ -60,14 +54,11 @@ class Background:
 
 @dataclass(frozen=True)
 class Look:
-    """How a model is shown beside the photos of V views.
+    """How a model is shown beside the photos of V views, by `render_image`.
 
     Args:
-        sh_degree: highest degree in use.
-        settings: of the rasterizer.
         background: behind the model, and behind transparent photos.
         exposures: [V, 3, 4] of the views (`interpolated_exposures`); None: the model's own colours.
-        antialiased: as of `render_image`.
     """
 
     sh_degree: int
@@ -79,8 +70,7 @@ class Look:
     @property
     def options(self) -> dict[str, Any]:
         """Options of `render_image` for the model's own colours."""
-        options = {"sh_degree": self.sh_degree, "settings": self.settings, "background": self.background}
-        return options | {"antialiased": self.antialiased}
+        return {name: getattr(self, name) for name in ("sh_degree", "settings", "background", "antialiased")}
 
     def colors(self, colors: Tensor, view_id: int) -> Tensor:
         """[H, W, 3], 0 .. 1: the model's own colours [H, W, 3], seen by a view, with its exposure."""
@@ -93,10 +83,9 @@ class Look:
 def interpolated_exposures(offsets: Tensor, trained: Sequence[str], photos: Sequence[str]) -> Tensor:
     """[W, 3, 4] float32, ``A | b`` of photos: the mean of their neighbours', times how well it tells exposures.
 
-    How well is measured on the training photos: the slope of the least squares of their exposures against their
-    neighbours' mean, within 0 .. 1. It is nearly 1 where exposures follow the sequence, and 0, which gives the
-    identity, where they differ at random, as in a collection of many people's photos. A photo without a neighbour has
-    the identity, too.
+    How well is measured on the training photos between two others: the slope of the least squares of their exposures
+    against their neighbours' mean, within 0 .. 1. It is nearly 1 where exposures follow the sequence, and 0, which
+    gives the identity, where they differ at random, as in a collection of many people's photos.
 
     Args:
         offsets: [V, 3, 4], of the training photos (`turbogs_plugin.engine.exposures.Exposures`).
@@ -104,13 +93,9 @@ def interpolated_exposures(offsets: Tensor, trained: Sequence[str], photos: Sequ
         photos: [W] names; a training photo gets its neighbours' exposure, not its own.
     """
     names = [*trained, *photos]
-    return neighbours(names, trained, photos).mean(offsets) * _slope(offsets, neighbours(names, trained, trained))
-
-
-def _slope(offsets: Tensor, among: Neighbours) -> float:
-    """Least-squares slope of photos' exposures [V, 3, 4] on their neighbours' mean, within 0 .. 1; 0 where no photo has
-    a neighbour on either side."""
+    among = neighbours(names, trained, trained)
     between = (among.weights > 0).all(dim=1).to(offsets.device)  # [V]
     own, told = offsets[between].double(), among.mean(offsets)[between].double()
     length = float(told.square().sum())
-    return min(1.0, max(0.0, float((own * told).sum()) / length)) if length > 0 else 0.0
+    slope = min(1.0, max(0.0, float((own * told).sum()) / length)) if length > 0 else 0.0
+    return neighbours(names, trained, photos).mean(offsets) * slope

@@ -38,10 +38,8 @@ class TrainingLoop:
     """Trains from mark to mark of a pace, and measures the time.
 
     Args:
-        trainer: new, or with a state loaded.
         pace: where to stop on the way, and where to end; None: after the configured iterations.
         listeners: called in this order.
-        seconds: training time that passed before.
         ranks: the processes that train the model; each has such a loop, and the first one's clock counts.
     """
 
@@ -57,18 +55,11 @@ class TrainingLoop:
         self.pace = pace or Pace(trainer.config.train)
         self.listeners = list(listeners)
         self.clock = TrainingClock(trainer.device, seconds)
-        self.ranks = ranks
-        self.stopped = False
+        self.ranks, self.stopped = ranks, False
 
     def run(self, resumed: bool = False) -> None:
-        """Train to the end, or until `stop`.
-
-        Args:
-            resumed: the trainer's state was loaded, so its error maps are there.
-
-        Raises:
-            TrainingStopped: the model is lost, another process ended, or devices hold different models.
-        """
+        """Train to the end, or until `stop`. Where the run is resumed, its error maps are there. Raises
+        `TrainingStopped` where the model is lost, another process ended, or devices hold different models."""
         trainer, pace, clock = self.trainer, self.pace, self.clock
         if not resumed:
             with clock:
@@ -105,11 +96,7 @@ class TrainingLoop:
         self.clock.seconds = self.ranks.agree(self.clock.seconds)
 
     def stop(self, signal: int = SIGTERM) -> None:
-        """Stop after the present iteration; where several processes train, as soon as all know of it.
-
-        Args:
-            signal: number of the one that asks for it.
-        """
+        """Stop after the present iteration, or as soon as all processes know of it; a signal's number asks for it."""
         if not self.ranks.ask_to_stop(signal):
             self.stopped = True
 
@@ -119,8 +106,7 @@ class TrainingLoop:
         return self.trainer.iteration >= self.pace.iterations
 
     def _is_short_of(self, mark: int) -> bool:
-        """Whether to go on towards a mark. At a mark or a stop it waits for the GPU and subtracts lost iterations, so
-        that none is missing there."""
+        """Whether to go on towards a mark. At a mark or a stop it waits for the GPU, and no iteration is missing."""
         if self.trainer.iteration >= mark or self.stopped:
             self.trainer.repeat_lost(wait=True)
         return self.trainer.iteration < mark and not self.stopped

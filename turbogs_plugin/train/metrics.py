@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -26,13 +27,8 @@ from turbogs_plugin.types import Gaussians
 
 PSNR_LIMIT = 100.0
 """PSNR of an exact match, in dB."""
-
-SSIM_SIDE = 11
-"""Side of SSIM's Gaussian window; a smaller image has no SSIM."""
-
-SSIM_SIGMA = 1.5
-"""Standard deviation of SSIM's window, in pixels."""
-
+SSIM_SIDE, SSIM_SIGMA = 11, 1.5
+"""Side and standard deviation of SSIM's Gaussian window, in pixels; an image of smaller sides has no SSIM."""
 SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 """Constants of Wang et al. 2004 for values 0 .. 1."""
 
@@ -42,8 +38,7 @@ ImageError = Callable[[Tensor, Tensor], float]
 
 @dataclass
 class ViewMetrics(FurtherErrors):
-    """Errors of one test view, without its masked pixels; `ssim` and `lpips` are NaN where they cannot be computed or
-    are not wanted."""
+    """Errors of one test view, without its masked pixels; NaN where they cannot be computed or are not wanted."""
 
     name: str
     psnr: float
@@ -54,12 +49,7 @@ class ViewMetrics(FurtherErrors):
 
 @dataclass
 class Metrics:
-    """Errors of a model on its test views.
-
-    Args:
-        views: the errors of each test view.
-        fps: test views rendered per second, one after the other.
-    """
+    """Errors of a model on each test view, and how many of them were rendered per second, one after the other."""
 
     views: list[ViewMetrics]
     fps: float
@@ -74,8 +64,7 @@ class Metrics:
     @property
     def worst_psnr(self) -> float:
         """PSNR of the worst view, as a mean hides one view that something covers. NaN if a view has no value."""
-        values = [view.psnr for view in self.views]
-        return math.nan if any(map(math.isnan, values)) else min(values)
+        return float(np.min([view.psnr for view in self.views]))
 
 
 @torch.no_grad()
@@ -87,13 +76,11 @@ def evaluate(
     refined: bool = False,
     view_ids: Sequence[int] | None = None,
 ) -> Metrics:
-    """Render views, one at a time, and compare it with its photo. Where views have exposures, errors of the
-    model's own colours are given beside.
+    """Render views, one at a time, and compare each with its photo. Where views have exposures, errors of the model's
+    own colours are given beside.
 
     Args:
         gaussians: the model, on the views' device.
-        views: cameras and photos.
-        look: how the model is shown.
         lpips: from `load_lpips`, if wanted. It sees the photo's pixels where it is masked.
         refined: where views have refined cameras, give the errors by these cameras, too.
         view_ids: at least one; None: all.
@@ -105,7 +92,7 @@ def evaluate(
         name = views.names[view_id]
         synchronize(gaussians.device)
         started = time.perf_counter()
-        own = _render(gaussians, views, view_id, look)
+        own = render_image(gaussians, views.cameras, view_id, **look.options).colors  # may be above 1
         image = look.colors(own, view_id)
         synchronize(gaussians.device)
         seconds += time.perf_counter() - started
@@ -119,7 +106,7 @@ def evaluate(
             for measure in MEASURES:
                 setattr(measured, f"{kind}_{measure}", getattr(other, measure))
         if lpips is not None:
-            measured.lpips = lpips(image if mask is None else _unmasked(image, photo, mask), photo)
+            measured.lpips = lpips(_unmasked(image, photo, mask), photo)
         metrics.append(measured)
     return Metrics(metrics, fps=len(metrics) / seconds)
 
@@ -127,12 +114,7 @@ def evaluate(
 @torch.no_grad()
 def render_view(gaussians: Gaussians, views: PosedImages, view_id: int, look: Look) -> Tensor:
     """[H, W, 3] float32, 0 .. 1: the model seen by one of the cameras."""
-    return look.colors(_render(gaussians, views, view_id, look), view_id)
-
-
-def _render(gaussians: Gaussians, views: PosedImages, view_id: int, look: Look) -> Tensor:
-    """[H, W, 3] float32, the model's own colours, which may be above 1."""
-    return render_image(gaussians, views.cameras, view_id, **look.options).colors
+    return look.colors(render_image(gaussians, views.cameras, view_id, **look.options).colors, view_id)
 
 
 def psnr(image: Tensor, photo: Tensor) -> float:
@@ -142,34 +124,23 @@ def psnr(image: Tensor, photo: Tensor) -> float:
 
 
 def compare(name: str, image: Tensor, photo: Tensor, mask: Tensor | None = None) -> ViewMetrics:
-    """Errors of an image against a photo, both [H, W, 3] float, 0 .. 1. SSIM has its usual Gaussian window of 11.
-
-    Args:
-        mask: [H, W] bool, the pixels to compare, at least one; None: all. SSIM's is the mean over their windows, in
-            which masked pixels are the photo's in both images.
-    """
-    of_windows = image if mask is None else _unmasked(image, photo, mask)
-    similarity = ssim(of_windows, photo, mask).item() if min(image.shape[:2]) >= SSIM_SIDE else math.nan
+    """Errors of an image against a photo, both [H, W, 3] float, 0 .. 1, at the one or more pixels of a mask [H, W],
+    or all. SSIM is the mean over their windows, in which masked pixels are the photo's in both images."""
+    enough = min(image.shape[:2]) >= SSIM_SIDE
+    similarity = ssim(_unmasked(image, photo, mask), photo, mask).item() if enough else math.nan
     if mask is not None:
         image, photo = image[mask], photo[mask]  # [P, 3]
     return ViewMetrics(name, psnr(image, photo), similarity, (image - photo).abs().mean().item())
 
 
-def _unmasked(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
-    """[H, W, 3]: the image with the photo's pixels where the mask [H, W] is False."""
-    return torch.where(mask[:, :, None], image, photo)
+def _unmasked(image: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
+    """[H, W, 3]: the image with the photo's pixels where a mask [H, W] is False."""
+    return image if mask is None else torch.where(mask[:, :, None], image, photo)
 
 
 def ssim(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Structural similarity, the mean over all pixels and channels; borders are mirrored, as torchmetrics does.
-
-    Args:
-        image, photo: [H, W, 3] float, 0 .. 1, with sides of at least `SSIM_SIDE`.
-        mask: [H, W] bool, the pixels to take the mean over; None: all.
-
-    Returns:
-        A scalar on the images' device.
-    """
+    """Structural similarity of images [H, W, 3] float, 0 .. 1, with sides of at least `SSIM_SIDE`: a scalar, the mean
+    over channels and the pixels of a mask [H, W], or all; borders are mirrored, as torchmetrics does."""
     x, y = (picture.permute(2, 0, 1) for picture in (image, photo))  # [3, H, W]
     mean_x, mean_y, xx, yy, xy = _blurred(torch.stack((x, y, x * x, y * y, x * y)))
     variances = (xx - mean_x.square()).clamp(min=0.0) + (yy - mean_y.square()).clamp(min=0.0)
@@ -198,14 +169,10 @@ def _blurred(images: Tensor) -> Tensor:
 
 @dataclass
 class Evaluations(Listener):
-    """Evaluates the model and passes the result to all listeners.
-
-    Args:
-        test: the test views, on the trainer's device.
+    """Evaluates the model on test views, on its device, and passes the result to all listeners.
 
     Attributes:
-        history: every evaluation.
-        metrics: errors of the newest one; None where this process made none.
+        metrics: errors of the newest evaluation; None where this process made none.
     """
 
     test: PosedImages
@@ -220,7 +187,7 @@ class Evaluations(Listener):
         trainer = loop.trainer
         trainer.require_finite()
         metrics = evaluate(trainer.gaussians, self.test, trainer.look(self.test.names), refined=loop.finished)
-        mean = metrics.mean
+        mean, self.metrics = metrics.mean, metrics
         evaluation = Evaluation(
             iteration=trainer.iteration,
             train_seconds=loop.clock.seconds,
@@ -233,6 +200,5 @@ class Evaluations(Listener):
             **mean.further(),
         )
         self.history.append(evaluation)
-        self.metrics = metrics
         for listener in loop.listeners:
             listener.evaluated(loop, evaluation)

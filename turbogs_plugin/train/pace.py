@@ -1,12 +1,11 @@
 """The clock of training, and the pace of a run: how far it goes and where it stops, by iterations or by time.
 
 A time budget makes the run as long as ``seconds left / seconds of an iteration``: before it by a few iterations that
-are timed and thrown away, then again and again while it trains.
+are timed and thrown away, then at each look at the clock.
 """
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from turbogs_plugin.config.sections import TrainConfig
 from turbogs_plugin.device import free_device_memory, synchronize
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.plan.memory import cap_of
+from turbogs_plugin.plan.photo_gains import PhotoGains
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.trainer import Trainer
 
@@ -33,15 +33,11 @@ TRIAL_ITERATIONS = {"cuda": 20, "cpu": 2}
 
 
 class TrainingClock:
-    """Seconds of training. Use it as a context around training alone; it waits for the GPU at both ends.
-
-    Args:
-        seconds: training time that passed before.
-    """
+    """Seconds of training, from those that passed before. Use it as a context around training alone; it waits for the
+    GPU at both ends."""
 
     def __init__(self, device: torch.device, seconds: float = 0.0) -> None:
-        self.device = device
-        self.seconds = seconds
+        self.device, self.seconds = device, seconds
 
     def __enter__(self) -> TrainingClock:
         synchronize(self.device)
@@ -67,24 +63,18 @@ class Pace:
     """A fixed number of iterations, or as many as fit into a time.
 
     With a time, everything that depends on progress (learning rates, sampling, density control, evaluations) ends with
-    it: T and the end of density control follow the seconds of an iteration.
+    it: T (`iterations`) and the end of density control (`refine_until`) follow the seconds of an iteration.
 
     Args:
         train: settings of the run. With a time, its iterations and its end of density control are the first guess.
         budget: seconds when to end, on the clock of training; None: after the configured iterations.
-
-    Attributes:
-        iterations: T, as known now.
-        refine_until: last iteration of density control, as known now.
     """
 
     def __init__(self, train: TrainConfig, budget: float | None = None) -> None:
         self.iterations, self.refine_until = train.written_iterations, int(train.refine_until)
-        self._budget, self._fractions = budget, train.evaluate_at
-        self._save_every = train.checkpoint_every or math.inf
+        self._budget, self._fractions, self._save_every = budget, train.evaluate_at, train.checkpoint_every
         self._refine_share = min(1.0, self.refine_until / self.iterations)
-        self._mean = 0.0  # seconds of a recent iteration; 0: none was timed
-        self._latest = math.inf  # seconds of an iteration of the latest stretch
+        self._mean = (budget or 0.0) / self.iterations  # seconds of an iteration; 0: none was timed
         self._saved: float | None = None  # seconds at the last checkpoint
         self._last = (0, 0.0)  # iteration and seconds where the present stretch began
         self._evaluated = 0  # marks of evaluations that were passed
@@ -92,41 +82,38 @@ class Pace:
     def next_mark(self, iteration: int, seconds: float) -> int:
         """The finished iteration to stop at next."""
         self._last = (iteration, seconds)
-        marks: list[float] = [iteration - iteration % self._save_every + self._save_every]
-        if self._saved is None:
-            self._saved = seconds
-        if self._save_every < math.inf:
-            marks.append(iteration + max(1, int(LOOK_AFTER / max(1e-9, self._latest))))
-        marks += [mark for mark in self._evaluations() if mark > iteration]
+        self._saved = seconds if self._saved is None else self._saved
+        marks = [mark for mark in self._evaluations() if mark > iteration]
+        stretches = []  # seconds until the next look at the clock
+        if self._save_every:
+            marks.append(iteration - iteration % self._save_every + self._save_every)
+            stretches.append(LOOK_AFTER)
         if self._budget is not None:
-            left = max(0.0, self._budget - seconds)
-            mean = self._mean or left / max(1, self.iterations - iteration)
-            stretch = min(MARK_SHARE * self._budget, 0.5 * left)
-            marks.append(iteration + max(1, int(stretch / max(1e-9, mean))))
-        return int(min(self.iterations, *marks))
+            stretches.append(min(MARK_SHARE * self._budget, max(0.0, 0.5 * (self._budget - seconds))))
+        marks += [iteration + max(1, int(stretch / self._mean if self._mean else 0)) for stretch in stretches]
+        return min(self.iterations, *marks)
 
     def reached(self, iteration: int, seconds: float) -> tuple[bool, bool]:
         """Whether an evaluation is due where training has stopped, and whether a checkpoint is."""
         before, began = self._last
         if iteration > before:
-            self._latest = (seconds - began) / (iteration - before)
-        if self._budget is not None and iteration > before:
-            latest = (seconds - began) / (iteration - before)
-            weight = min(0.5, (seconds - began) / (MARK_SHARE * self._budget)) if self._mean else 1.0
-            self._mean += weight * (latest - self._mean)
-            left = max(0.0, self._budget - seconds)
-            self.iterations = iteration + int(left / max(1e-9, self._mean) + 0.5)  # half an iteration early or late
-            if iteration < self.refine_until:  # density control that has ended does not restart
-                self.refine_until = max(iteration, round(self._refine_share * self.iterations))
+            share = 1.0 if self._budget is None else (seconds - began) / (MARK_SHARE * self._budget)
+            latest = max(1e-9, (seconds - began) / (iteration - before))
+            self._mean += (min(0.5, share) if self._mean else 1.0) * (latest - self._mean)
+            if self._budget is not None:
+                left = max(0.0, self._budget - seconds)
+                self.iterations = iteration + int(left / self._mean + 0.5)  # half an iteration off at most
+                if iteration < self.refine_until:  # density control that has ended does not restart
+                    self.refine_until = max(iteration, round(self._refine_share * self.iterations))
         finished, passed = iteration >= self.iterations, sum(mark <= iteration for mark in self._evaluations())
         evaluate, self._evaluated = finished or passed > self._evaluated, max(passed, self._evaluated)
-        late = self._save_every < math.inf and seconds - (self._saved or 0.0) >= SAVE_AFTER
-        if save := finished or late or iteration % self._save_every == 0:
+        late = seconds - (self._saved or 0.0) >= SAVE_AFTER or iteration % (self._save_every or 1) == 0
+        if save := finished or bool(self._save_every and late):
             self._saved = seconds
         return evaluate, save
 
     def _evaluations(self) -> set[int]:
-        """Counts of finished iterations after which to evaluate."""
+        """Numbers of finished iterations after which to evaluate."""
         return {self.iterations, *(max(1, round(part * self.iterations)) for part in self._fractions)}
 
     def state_dict(self) -> dict[str, Any]:
@@ -145,22 +132,18 @@ class Pace:
         self._mean, self._evaluated = state["iteration_seconds"], state["evaluated"]
 
 
-def fitted_to_time(config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE) -> tuple[Config, float]:
+def fitted_to_time(
+    config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE, gains: PhotoGains | None = None
+) -> tuple[Config, float]:
     """The configuration with as many iterations as its time budget leaves room for, and the seconds that went into
-    timing some of them, which count as training.
-
-    The iterations are timed with the initial model. Iterations of a model that grows take longer; `Pace` corrects
-    their number while it trains.
-
-    Args:
-        ranks: the processes that will train together; all call this, and the first one's clock counts.
-    """
+    timing some of them with the initial model, which count as training. `Pace` corrects their number as the model
+    grows. All `ranks` that will train together call this, and the first one's clock counts."""
     budget = config.budget.seconds()
     if budget is None:
         return config, 0.0
     count, clock = TRIAL_ITERATIONS[device.type], TrainingClock(device)
     still = config.changed(density={"type": "none", "max_gaussians": cap_of(config)})  # the initial model all the time
-    trial = Trainer(still, scene, device, engine=ranks.engine(device))
+    trial = Trainer(still, scene, device, ranks.engine(device), gains)
     trial.iteration = int(config.train.iterations) // 2  # views, pixels and bands of an iteration are near their means
     for _ in range(2):  # the first time loads code and sizes buffers
         begun = clock.seconds

@@ -33,15 +33,12 @@ class ParameterMean:
     """
 
     def __init__(self, share: float, tensors: Mapping[str, Tensor]) -> None:
-        self.share = share
-        self.count = 0
+        self.share, self.count = share, 0
         self.tensors = {name: value.detach()[:0].clone() for name, value in tensors.items()}
 
     def due(self, iteration: int, total: int) -> bool:
-        """Whether the parameters after this number of iterations, of `total`, count.
-
-        Where none are to count yet, it begins anew: a time budget has made the run longer.
-        """
+        """Whether the parameters after this number of iterations, of `total`, count. Where none are to count yet, it
+        begins anew: a time budget has made the run longer."""
         if iteration < (1.0 - self.share) * total:
             self.restart()
             return False
@@ -66,11 +63,8 @@ class ParameterMean:
 
     @torch.no_grad()
     def overwrite(self, tensors: Mapping[str, Tensor]) -> None:
-        """Write the mean, if there is one, into the tensors whose mean it is, and begin anew.
-
-        Raises:
-            RuntimeError: from torch, where they have other rows.
-        """
+        """Write the mean, if there is one, into the tensors whose mean it is, and begin anew. Raises torch's
+        `RuntimeError` where they have other rows."""
         if self.count:
             for name, mean in self.tensors.items():
                 tensors[name].copy_(mean)

@@ -20,6 +20,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable, write_text_atomically
 from turbogs_plugin.plan import Plan, make_plan
 from turbogs_plugin.plan.memory import hold_to_limit, most_views, room_note, within_memory
+from turbogs_plugin.plan.photo_gains import PhotoGains
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.clock import WallClock
@@ -38,14 +39,7 @@ IMPORTS, CAMERAS = "interpreter and imports", "cameras of photos alone"
 
 
 def plan_run(config: Config, processes: int = 1) -> Plan:
-    """The plan that `train` would make now. The capture's notes are printed.
-
-    Args:
-        processes: number of processes that would train together.
-
-    Raises:
-        InputError: as `train`.
-    """
+    """The plan that `train` would make now, with this number of processes. The capture's notes are printed."""
     device = resolve_device(config.train.device)
     scene = open_scene(config.scene, config.train.refine_cameras)
     plan = make_plan(config, scene, device, processes)
@@ -53,28 +47,30 @@ def plan_run(config: Config, processes: int = 1) -> Plan:
     return plan
 
 
-def new_loop(config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE) -> TrainingLoop:
+def new_loop(
+    config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE, gains: PhotoGains | None = None
+) -> TrainingLoop:
     """A training that has not begun, within its budgets. Runs and the cells of studies both begin here.
 
     Args:
         config: decided (`Plan.apply`). The trainer gets it with the cap and the iterations that keep the budgets.
         ranks: the processes that train this model together; each calls this.
+        gains: the photos', from the facts of the plan.
 
     Raises:
-        InputError: a limit of memory is too small; the message names one that would do. Or the schedule has more views
-            an iteration than a GPU takes.
+        InputError: a limit of memory is too small, or the schedule has more views an iteration than a GPU takes.
     """
-    views = most_views(config, len(scene.train))
-    if device.type == "cuda" and views > MAX_VIEWS:
+    views, on_gpu = most_views(config, len(scene.train)), device.type == "cuda"
+    if on_gpu and views > MAX_VIEWS:
         raise InputError(f"schedule: {views} views an iteration, and a GPU takes at most {MAX_VIEWS}: ask for fewer")
     hold_to_limit(config, device)
     if ranks.count > 1:  # the first process's plan: plans look at the machine's free memory, which differs
         config = resolve(ranks.agree(config.to_mapping()))
     config = within_memory(config, scene)
-    if device.type == "cuda" and ranks.first and (note := room_note(config, scene, free_bytes(device))):
+    if on_gpu and ranks.first and (note := room_note(config, scene, free_bytes(device))):
         print(note, file=sys.stderr)
-    config, seconds = fitted_to_time(config, scene, device, ranks)
-    trainer = Trainer(config, scene, device, engine=ranks.engine(device))
+    config, seconds = fitted_to_time(config, scene, device, ranks, gains)
+    trainer = Trainer(config, scene, device, ranks.engine(device), gains)
     return TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), seconds=seconds, ranks=ranks)
 
 
@@ -88,11 +84,7 @@ def fit(scene: Scene | Path | str, *overrides: str, config: str = DEFAULT_CONFIG
         config: name of a packaged configuration, or a YAML file.
 
     Returns:
-        The model, on the device of the training and in the scene's coordinates.
-
-    Raises:
-        InputError: anything wrong with the input.
-        TrainingStopped: the model is lost.
+        The model, on the device of the training and in the scene's coordinates. Errors as of `train`.
     """
     settings = load_config(config, overrides)
     device = resolve_device(settings.train.device)
@@ -100,7 +92,8 @@ def fit(scene: Scene | Path | str, *overrides: str, config: str = DEFAULT_CONFIG
         scene = open_scene(replace(settings.scene, path=str(scene)), settings.train.refine_cameras)
     else:
         scene = refine_cameras(scene, settings.train.refine_cameras)
-    loop = new_loop(make_plan(settings, scene, device).apply(settings), scene, device)
+    plan = make_plan(settings, scene, device)
+    loop = new_loop(plan.apply(settings), scene, device, gains=plan.facts.gains)
     loop.run()
     loop.trainer.require_finite()
     return loop.trainer.gaussians
@@ -142,15 +135,14 @@ def train(
     plan = make_plan(config, scene, device, ranks.count)
     clock.mark("plan")
     with _fitting(scene):
-        loop = new_loop(_independent(plan.apply(config), device), scene, device, ranks)
+        loop = new_loop(_independent(plan.apply(config), device), scene, device, ranks, plan.facts.gains)
         session = RunSession(folder, scene, loop, clock)
     with folder.owned(new=True) if ranks.first else nullcontext():
         if ranks.first:
-            resolved = loop.trainer.config
-            print("\n".join([*scene.notes, plan.text()]), file=sys.stderr)
+            resolved, told = loop.trainer.config, [*scene.notes, plan.text()]
             if resolved.budget.time:
-                length = f"about {resolved.train.iterations} iterations"
-                print(f"{resolved.budget.time} of training: {length}", file=sys.stderr)
+                told.append(f"{resolved.budget.time} of training: about {resolved.train.iterations} iterations")
+            print("\n".join(told), file=sys.stderr)
             write_text_atomically(folder.plan, plan.text() + "\n")
             write_text_atomically(folder.asked, config.to_yaml())
             write_text_atomically(folder.config, resolved.to_yaml())
@@ -165,17 +157,16 @@ def resume(
     watch: Watch = (),
     trusted: bool = False,
 ) -> RunSession:
-    """Go on with a stopped run from its newest checkpoint, with its own configuration, in which nothing is `auto`.
-
-    On a CPU, the result is bit for bit that of a run never stopped; `TrainingState.state_dict` says why.
+    """Go on with a stopped run from its newest checkpoint, with its own configuration, in which nothing is `auto`. On a
+    CPU, the result is bit for bit that of a run never stopped; `TrainingState.state_dict` says why.
 
     Args:
         report, clock, ranks, watch: as in `train`. The number of processes may be another than before.
         trusted: as for `resolve_complete`.
 
     Raises:
-        InputError: no run there, a finished one without checkpoints, an unusable checkpoint, a changed
-            capture, or a machine without what the run needs; then nothing was changed.
+        InputError: no run there, a finished one without checkpoints, an unusable checkpoint, a changed capture, or a
+            machine without what the run needs; then nothing was changed.
         TrainingStopped: the run cannot go on.
     """
     clock = clock or WallClock()
@@ -190,16 +181,14 @@ def resume(
 
 def _resumed(folder: RunFolder, config: Config, clock: WallClock, ranks: Ranks) -> RunSession:
     """The session of a run as its newest checkpoint has it. Errors as of `resume`."""
-    checkpoint = latest_checkpoint(folder.checkpoints)
-    if checkpoint is None and folder.model.is_file():
-        raise InputError(
-            f"'{folder.path}' is finished and has no checkpoint to go on from: use its {folder.model.name}"
-        )
+    checkpoint, model = latest_checkpoint(folder.checkpoints), folder.model
+    if checkpoint is None and model.is_file():
+        raise InputError(f"'{folder.path}' is finished and has no checkpoint to go on from: use its {model.name}")
     state = None if checkpoint is None else load_checkpoint(checkpoint)
     scene, device = open_started(config, clock, ranks, trained=True)
     hold_to_limit(config, device)
     with _fitting(scene):
-        trainer = Trainer(config, scene, device, state is not None, ranks.engine(device))
+        trainer = Trainer(config, scene, device, ranks.engine(device), resuming=state is not None)
         loop = TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), ranks=ranks)
         session = RunSession(folder, scene, loop, clock)
         if state is not None:

@@ -16,30 +16,16 @@ from turbogs_plugin.yaml_json import read_yaml
 
 
 class RunFolder:
-    """The paths of a run's files.
-
-    Attributes:
-        asked: the configuration as the user asked for it.
-        config: the resolved configuration, after plan and budgets.
-        lock, owner: locked by the process that writes the run, and its name while it does.
-        wall: the `WallRecord`.
-        tensorboard: folder of event files, where they are asked for.
-    """
+    """The paths of a run's files: among them the configuration as it was `asked` for, and `config` after plan and
+    budgets; `lock`, which the process that writes the run holds, and `owner`, its name while it does."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.asked = path / "asked.yaml"
-        self.config = path / "config.yaml"
-        self.plan = path / "plan.txt"
-        self.history = path / "history.jsonl"
-        self.lock = path / ".lock"
-        self.owner = path / ".owner"
-        self.wall = path / "wall.json"
-        self.checkpoints = path / "checkpoints"
-        self.report = path / "report.md"
-        self.model = path / "model.ply"
-        self.renders = path / "renders"
-        self.tensorboard = path / "tensorboard"
+        self.asked, self.config, self.plan = path / "asked.yaml", path / "config.yaml", path / "plan.txt"
+        self.history, self.wall = path / "history.jsonl", path / "wall.json"
+        self.lock, self.owner = path / ".lock", path / ".owner"
+        self.checkpoints, self.model, self.report = path / "checkpoints", path / "model.ply", path / "report.md"
+        self.renders, self.tensorboard = path / "renders", path / "tensorboard"
 
     def require_new(self) -> None:
         """Raise `InputError` if the folder holds anything, or cannot be made."""
@@ -49,15 +35,9 @@ class RunFolder:
 
     @contextmanager
     def owned(self, new: bool = False) -> Iterator[None]:
-        """The folder is this process's alone while entered. A line on stderr tells of an owner that was killed, whose
-        lock the system has freed, and of a disk that knows no locks.
-
-        Args:
-            new: the folder is made.
-
-        Raises:
-            InputError: another process writes to it; or it is not `new`, for one has written to it meanwhile.
-        """
+        """The folder, which is made where it is `new`, is this process's alone while entered. A line on stderr tells of
+        an owner that was killed, whose lock the system has freed, and of a disk that knows no locks. Raises
+        `InputError` where another process writes to it, or has written to a new one meanwhile."""
         from filelock import FileLock, Timeout  # of the extra `train`
 
         self.path.mkdir(parents=new, exist_ok=True)
@@ -90,17 +70,15 @@ class RunFolder:
             self.path.rmdir()
 
     def finished(self, reported: bool) -> bool:
-        """Whether nothing of the run is left to do: its model is there, which is written at the end, and its report if
-        that is `reported`."""
+        """Whether the run's model, which is written at the end, is there, and its report if that is `reported`."""
         return self.model.is_file() and (self.report.is_file() or not reported)
 
     def read_config(self, built: bool = False, trusted: bool = False) -> Config:
-        """The resolved configuration of the run. Raises `InputError` if this is no run, or part of it is missing.
-        Arguments as of `resolve_complete`."""
+        """The resolved configuration of the run. Arguments and errors as of `resolve_complete`."""
         return self._read(self.config, True, built, trusted)
 
     def read_asked(self) -> Config:
-        """The configuration that was asked for. Raises `InputError` if it is missing or incomplete."""
+        """The configuration that was asked for. Errors as of `resolve_complete`."""
         return self._read(self.asked, False)
 
     def _read(self, file: Path, *how: bool) -> Config:

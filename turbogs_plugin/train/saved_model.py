@@ -1,8 +1,8 @@
 """Models to render, measure, hand over or start from: a run's newest one, or one that was trained anywhere.
 
 A model from a file is taken to be in its capture's own coordinates, or where its points lie by nerfstudio's file beside
-it (`turbogs_plugin.model.placement`). gsplat's example trainer works in others unless it is told not to
-(`turbogs_plugin.model.placement`); `train.init_world` says which.
+it (`turbogs_plugin.model.placement`). gsplat's example trainer works in others unless it is told not to;
+`train.init_world` says which.
 """
 
 from __future__ import annotations
@@ -34,34 +34,23 @@ from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
 
 REMEDY = "; save the model again, or as a .ply"
 KINDS = "a .ply, .spz or gsplat's .pt of a 3DGS model, a checkpoint of TurboGS, or a run's folder"
-_SPLAT_TRANSFORM = "convert it by  npx @playcanvas/splat-transform '{}' model.ply"
 _OTHERS = {
-    **dict.fromkeys(("sog", "splat", "ksplat", "lcc"), _SPLAT_TRANSFORM),
-    **dict.fromkeys(
-        ("glb", "gltf", "usd", "usda", "usdc", "usdz", "splatv"), "export a .ply from the program that made it"
-    ),
+    "sog splat ksplat lcc": "convert it by  npx @playcanvas/splat-transform '{}' model.ply",
+    "glb gltf usd usda usdc usdz splatv": "export a .ply from the program that made it",
     "ckpt": "export it by  ns-export gaussian-splat --load-config CONFIG.yml --output-dir FOLDER",
     "pth": "give the point_cloud/iteration_N/point_cloud.ply of its training",
 }
-"""Suffix of a model that is not read -> how to make a `.ply` of it."""
-_FOLDERS = (
-    "checkpoints/iteration-*.pt",
-    "point_cloud/iteration_*/point_cloud.ply",
-    "ckpts/ckpt_*_rank0.pt",
-    "ply/*.ply",
-)
+"""Suffixes of models that are not read -> how to make a `.ply` of one."""
+_INRIA, _GSPLAT = "point_cloud/iteration_*/point_cloud.ply", "ckpts/ckpt_*_rank0.pt"
+_FOLDERS = ("checkpoints/iteration-*.pt", _INRIA, _GSPLAT, "ply/*.ply")
 """Models in folders of trainings: of TurboGS, Inria's 3DGS and gsplat."""
 
 
 @dataclass
 class SavedModel:
-    """The parts of a run needed to render or export its model, or a model from a file.
-
-    Args:
-        folder, iteration: of the run; None for a model from a file.
-        exposures: [V, 3, 4] of the training photos; None where none were learnt, and for a model from a file.
-        antialiased: how it is drawn, as of `render_image`.
-    """
+    """The parts of a run needed to render or export its model; or a model from a file, whose `folder`, `iteration` and
+    `exposures` are None, and which may be `antialiased` (`render_image`). `exposures`: [V, 3, 4] of training photos, if
+    learnt."""
 
     folder: RunFolder | None
     config: Config
@@ -77,19 +66,14 @@ class SavedModel:
         return self.gaussians.sh_degree if self.iteration is None else self.config.train.sh_degree_at(self.iteration)
 
     def own_look(self, views: PosedImages | None = None) -> Look:
-        """Look of the model's own colours, on the background of evaluations and without exposures, beside views of its
-        capture if there is one."""
+        """Look of the model's own colours, without exposures, beside views of its capture if there is one."""
         transparent = views is not None and views.photos.transparent
         background = Background.of(self.config.train.background, transparent).evaluated
         return Look(self.sh_degree, self.config.raster, background, antialiased=self.antialiased)
 
 
 def load_model(path: Path, device: torch.device) -> SavedModel:
-    """The newest saved model of a run.
-
-    Raises:
-        InputError: no run there, no checkpoint, or an unusable one.
-    """
+    """The newest saved model of a run. Raises `InputError`: no run there, no checkpoint, or an unusable one."""
     folder = RunFolder(path)
     if path.is_file():
         raise InputError(f"'{path}' is a file, not a run's folder: name the capture of a model by --scene SCENE")
@@ -100,10 +84,9 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
     state = load_checkpoint(checkpoint)
     try:
         trained = state["trainer"]
-        gaussians = read_gsplat({"splats": trained["gaussians"]}, checkpoint).map(
-            lambda value: value.float().to(device)
-        )
-        if not all(value.isfinite().all() for _, value in gaussians.items()):
+        gaussians = read_gsplat({"splats": trained["gaussians"]}, checkpoint)
+        gaussians = gaussians.map(lambda value: value.float().to(device))
+        if not gaussians.finite_rows().all():
             raise ValueError("its Gaussians are not finite")
         exposures = trained["exposures"]["offsets"].to(device) if config.train.exposure is True else None
         if exposures is not None and not (exposures.shape[1:] == (3, 4) and exposures.isfinite().all()):
@@ -119,15 +102,9 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
 def load_with_capture(
     path: Path, given: Config | None, device: torch.device, needed: bool = True
 ) -> tuple[SavedModel, Scene | None, str]:
-    """A run's newest model or a given one, its capture, and why that is None: it is not there, and not `needed`.
-
-    Args:
-        path: folder of the run, or a model as `require_model` takes it.
-        given: says which capture a file's model belongs to, and how to render; None: `path` is a run.
-
-    Raises:
-        InputError: no such model, or no usable capture where it is needed.
-    """
+    """The newest model of a run, or a model as `require_model` takes it, whose capture and rendering are `given`; its
+    capture; and why that is None: it is not there, and not `needed`. Raises `InputError`: no such model, or no usable
+    capture where it is needed."""
     if given is not None:
         require_model(path)  # before its capture is read
         scene = open_scene(given.scene, given.train.refine_cameras)
@@ -143,11 +120,8 @@ def load_with_capture(
 
 
 def require_model(path: str | Path) -> Path:
-    """The file of a model: itself, or the newest one in the folder of a training (`_FOLDERS`).
-
-    Raises:
-        InputError: there is none, or it is of no kind that is read.
-    """
+    """The file of a model: itself, or the newest one in the folder of a training (`_FOLDERS`). Raises `InputError`
+    where there is none, or it is of no kind that is read."""
     path = Path(path)
     if path.is_dir():
         found = next(filter(None, (list(path.glob(pattern)) for pattern in _FOLDERS)), [])
@@ -157,8 +131,8 @@ def require_model(path: str | Path) -> Path:
     if not path.is_file():
         raise InputError(f"no such model '{path}': give {KINDS}")
     kind = path.suffix.lower().removeprefix(".")
-    if kind in _OTHERS:
-        raise InputError(f"'{path}' is a .{kind}, which is not read: {_OTHERS[kind].format(path)}")
+    for remedy in (remedy for kinds, remedy in _OTHERS.items() if kind in kinds.split()):
+        raise InputError(f"'{path}' is a .{kind}, which is not read: {remedy.format(path)}")
     if kind not in FORMATS:
         raise InputError(f"'{path}' is no model: give {KINDS}")
     return path
@@ -171,19 +145,11 @@ def is_antialiased(path: str | Path) -> bool:
 
 
 def load_given(path: str | Path, scene: Scene, world: str = "capture") -> Gaussians:
-    """A model from a file, in the frame of a scene. Warnings count Gaussians that are not finite, which are left out,
-    and say that a model does not fit the capture's points.
+    """A model as `require_model` takes it, float32 on the CPU, in the frame of the scene that it was trained on.
+    Warnings count Gaussians that are not finite, which are left out, and say that it does not fit the capture's points.
 
-    Args:
-        path: as `require_model` takes it.
-        scene: the capture that it was trained on.
-        world: `train.init_world`, the coordinates of a model that is not one of ours: ``capture`` or ``gsplat``.
-
-    Returns:
-        float32, on the CPU.
-
-    Raises:
-        InputError: the file is no such model, or the capture does not determine gsplat's world.
+    `world` is `train.init_world`, the coordinates of a model that is not one of ours: ``capture`` or ``gsplat``. Raises
+    `InputError` where the file is no such model, or the capture does not determine gsplat's world.
     """
     gaussians, to_capture = read_given(path)
     if to_capture is None:
@@ -196,7 +162,9 @@ def _to_capture(gaussians: Gaussians, path: Path, scene: Scene, world: str) -> S
     splat-transform, whose x is left and z forward, is turned about y beside Niantic's."""
     points = scene.frame.restore_points(scene.points.cpu().numpy())
     if world == "gsplat":
-        changes = [change.inverse() for change in gsplat_worlds(_own_viewmats(scene), points)]
+        views = torch.cat([each.cameras.viewmats.cpu() for each in (scene.train, scene.test)])
+        viewmats = scene.frame.restore_poses(views.numpy())  # [V, 4, 4], in the capture's own coordinates
+        changes = [change.inverse() for change in gsplat_worlds(viewmats, points)]
         if not changes:
             raise InputError(
                 f"{path}: the cameras and points of {scene.name} do not determine gsplat's normalised world: train the "
@@ -220,14 +188,8 @@ def _to_capture(gaussians: Gaussians, path: Path, scene: Scene, world: str) -> S
 
 
 def read_given(path: str | Path) -> tuple[Gaussians, Similarity | None]:
-    """A model from a file alone, and the change to its capture's own coordinates where the file knows it.
-
-    Returns:
-        float64, on the CPU, in the file's own coordinates; rows may be not finite.
-
-    Raises:
-        InputError: the file is no such model (`require_model`).
-    """
+    """A model from a file alone, float64 on the CPU in the file's own coordinates, some rows perhaps not finite; and
+    the change to its capture's own coordinates where the file knows it. Errors as of `require_model`."""
     file = require_model(path)
     kind = file.suffix.lower().removeprefix(".")
     if kind != "pt":
@@ -246,9 +208,3 @@ def read_given(path: str | Path) -> tuple[Gaussians, Similarity | None]:
         raise InputError(
             f"{file} is neither gsplat's checkpoint (step, splats) nor one of TurboGS (it has {keys}): give {KINDS}"
         ) from None
-
-
-def _own_viewmats(scene: Scene) -> np.ndarray:
-    """[V, 4, 4] float64 world to camera of all views, in the capture's own coordinates."""
-    both = (scene.train.cameras.viewmats, scene.test.cameras.viewmats)
-    return scene.frame.restore_poses(torch.cat([part.cpu() for part in both]).numpy())

@@ -9,10 +9,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -30,24 +30,19 @@ from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.metrics import Evaluations
 from turbogs_plugin.train.run_files import RunFolder
 
-if TYPE_CHECKING:
-    from rich.progress import Progress
-
 Report = Callable[["RunSession"], object]
 """Writes the report of a finished run."""
 Watch = Sequence[Callable[["RunSession"], Listener]]
 """Functions that are called with a run before it trains, and give one more listener of its first process each."""
 REFRESH_SECONDS = 0.1
-"""Time between two updates of the bar, so that fast iterations are not slowed down."""
+"""Time between two updates of the terminal's line, so that fast iterations are not slowed down."""
 
 
 @contextmanager
 def interruptible(stop: Callable[[int], None]) -> Iterator[None]:
     """While entered, the first SIGINT, SIGTERM or SIGHUP calls `stop` with its number, and a second one ends the
-    process, but for SIGHUP: a terminal that closes and its shell send one each. nohup's SIGHUP stays ignored.
-
-    Python allows handlers in the main thread alone; in others signals keep their usual effect.
-    """
+    process, but for SIGHUP: a terminal that closes and its shell send one each. nohup's SIGHUP stays ignored. Outside
+    the main thread, to which alone Python allows handlers, signals keep their usual effect."""
     here = threading.current_thread() is threading.main_thread()
     hangup = signal.SIGHUP if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN else signal.SIGTERM
     handled = {signal.SIGINT, signal.SIGTERM, hangup} if here else set()
@@ -81,26 +76,24 @@ class RunSession(Listener):
         wall: what is recorded of it when the model is written.
     """
 
-    def __init__(self, folder: RunFolder, scene: Scene, loop: TrainingLoop, clock: WallClock | None = None) -> None:
+    def __init__(self, folder: RunFolder, scene: Scene, loop: TrainingLoop, clock: WallClock) -> None:
         self.folder, self.scene, self.loop = folder, scene, loop
-        self.clock, self.wall = clock or WallClock(), WallRecord(0.0)
+        self.clock, self.wall = clock, WallRecord(0.0)
         self.trainer = loop.trainer
         self.test = place_views(scene.test, self.trainer.device, self.trainer.config.train.pixels_place)
         self.evaluations = Evaluations(self.test)
         self.history = self.evaluations.history
-        self.resumed = False
         self.signal: int | None = None
-        self._saved_at = -1
+        self.resumed, self._saved_at = False, -1
 
     def run(self, report: Report | None, watch: Watch = ()) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint. The model is written before it."""
         loop, trainer, ranks = self.loop, self.trainer, self.loop.ranks
         self.clock.mark("initial model")
         try:
-            with interruptible(self._stop), ExitStack() as shown:
+            with interruptible(self._stop), closing(TrainingProgress()) as progress:
                 loop.listeners = [self]  # first, so that its marks tell apart what the others do
                 if ranks.first:
-                    progress = TrainingProgress(shown)
                     loop.listeners += [self.evaluations, progress, *(listener_of(self) for listener_of in watch)]
                 self._train()
                 self.clock.mark("training")
@@ -133,7 +126,7 @@ class RunSession(Listener):
         return self
 
     def _train(self) -> None:
-        """Train to the end or a signal. Where the device's memory is full on the way, which others may share, training
+        """Train to the end or a signal. Where the device's memory, which others may share, is full on the way, training
         goes on once from the newest checkpoint, with memory of passes sized anew and what is unused given back."""
         try:
             return self.loop.run(self.resumed)
@@ -213,45 +206,39 @@ class RunSession(Listener):
 
 
 class TrainingProgress(Listener):
-    """Shows iteration, time left, iterations a second, test PSNR and number of Gaussians.
+    """A line on stderr for each evaluation; and on a terminal one below them with iteration, seconds left, iterations a
+    second and number of Gaussians."""
 
-    rich is imported for a terminal alone.
-
-    Args:
-        shown: the bar is there until this is left.
-    """
-
-    def __init__(self, shown: ExitStack) -> None:
+    def __init__(self) -> None:
+        self._terminal = sys.stderr.isatty()
+        self._began: tuple[int, float] | None = None  # the iteration and time of the first look
         self._next_refresh = 0.0
-        self._psnr = self._warning = ""
-        self._bar: Progress | None = None
-        if sys.stderr.isatty():
-            from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-            said = TextColumn("{task.description}")
-            columns = (MofNCompleteColumn(), BarColumn(None), TimeRemainingColumn(), said)
-            bar = Progress(*columns, console=Console(stderr=True), auto_refresh=False, expand=True)
-            self._bar, self._task = shown.enter_context(bar), bar.add_task("", total=None)
 
     def advanced(self, loop: TrainingLoop) -> None:
-        if self._bar is None or time.perf_counter() < self._next_refresh:
+        now, trainer = time.perf_counter(), loop.trainer
+        if not self._terminal or now < self._next_refresh:
             return
-        self._next_refresh = time.perf_counter() + REFRESH_SECONDS
-        trainer, speed = loop.trainer, self._bar.tasks[0].speed or 0.0
-        said = f"{speed:,.0f} it/s  {self._psnr}{len(trainer.gaussians):,} Gaussians  {self._warning}"
-        self._bar.update(self._task, completed=trainer.iteration, total=trainer.iterations, description=said)
-        with suppress(OSError):  # a terminal that closes
-            self._bar.refresh()
+        self._next_refresh = now + REFRESH_SECONDS
+        first, began = self._began = self._began or (trainer.iteration, now)
+        speed, left = (trainer.iteration - first) / max(1e-9, now - began), trainer.iterations - trainer.iteration
+        remaining = f"{left / speed:,.0f} s left  " if speed else ""
+        said = f"{remaining}{speed:,.0f} it/s  {len(trainer.gaussians):,} Gaussians"
+        self._say(f"{trainer.iteration}/{trainer.iterations}  {said}", "\r")
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         counts = {"non-finite losses": evaluation.nonfinite_losses, "skipped updates": evaluation.skipped_updates}
-        self._psnr = f"PSNR {evaluation.psnr:.2f} dB  "
-        self._warning = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
-        if self._bar is None:
-            total = loop.trainer.iterations
-            line = (
-                f"iteration {evaluation.iteration:>{len(str(total))}}/{total}  {evaluation.train_seconds:7.1f} s  "
-                f"test {self._psnr}SSIM {evaluation.ssim:.4f}  {evaluation.num_gaussians} Gaussians  {self._warning}"
-            )
-            print(line.rstrip(), file=sys.stderr, flush=True)
+        warning = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+        total = loop.trainer.iterations
+        line = (
+            f"iteration {evaluation.iteration:>{len(str(total))}}/{total}  {evaluation.train_seconds:7.1f} s  test PSNR"
+            f" {evaluation.psnr:.2f} dB  SSIM {evaluation.ssim:.4f}  {evaluation.num_gaussians} Gaussians  {warning}"
+        )
+        self._say(line.rstrip())
+
+    def close(self) -> None:
+        """Clear the terminal's line."""
+        self._say("", "")
+
+    def _say(self, line: str, end: str = "\n") -> None:
+        with suppress(OSError):  # a terminal that closes
+            print("\r\033[K" * self._terminal + line, end=end, file=sys.stderr, flush=True)

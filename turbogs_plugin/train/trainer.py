@@ -21,6 +21,7 @@ from turbogs_plugin.engine.rules import Dropout
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.limits import RESTRAIN_EVERY, Clearance, restrain_distant
 from turbogs_plugin.model.row_order import in_order_of_space
+from turbogs_plugin.plan.photo_gains import PhotoGains
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.train.training_state import TrainingState
@@ -31,25 +32,23 @@ DROPOUT_UNTIL = 0.95
 
 
 class Trainer(TrainingState):
-    """The iterations of one run.
-
-    Args:
-        config: the run's, in which nothing is ``auto`` any more.
-        scene: on any device.
-        device: where everything is computed and kept.
-        resuming: a state is loaded next, so that the model of `train.init` need not be there.
-        engine: does the computation; None: this device's (`engine_of`).
+    """The iterations of one run. Arguments as of `TrainingState`; no engine stands for the device's own (`engine_of`).
 
     Attributes:
         on_samples: called with the samples of each iteration, if anything; it must be cheap, and change nothing.
     """
 
     def __init__(
-        self, config: Config, scene: Scene, device: torch.device, resuming: bool = False, engine: Engine | None = None
+        self,
+        config: Config,
+        scene: Scene,
+        device: torch.device,
+        engine: Engine | None = None,
+        gains: PhotoGains | None = None,
+        resuming: bool = False,
     ) -> None:
         config.require_decided()
-        engine = engine_of(device, for_training=True) if engine is None else engine
-        super().__init__(config, scene, device, resuming, engine)
+        super().__init__(config, scene, device, engine or engine_of(device, for_training=True), gains, resuming)
         self.schedule = config.build("schedule")
         self.pixel_sampler = config.build("pixel_sampler")
         self.loss = config.build("loss")
@@ -109,10 +108,8 @@ class Trainer(TrainingState):
             self.parameter_mean.add(self.learnt())
 
     def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
-        """Loss and error maps, and the exposures of the photos where they are learnt.
-
-        Loss and maps are one step if the loss is a rule, else the loss's own code comes first.
-        """
+        """Loss and error maps, in one step if the loss is a rule, and the exposures of the photos where these are
+        learnt."""
         samples, update = truth.samples, MapUpdate(self.maps, step, self.nonfinite_losses)
         shown, terms = self.shown(colors, samples), self.loss.terms
         if terms is not None:
@@ -137,11 +134,8 @@ class Trainer(TrainingState):
             self.optimizer.step(self.gaussians, gradients, step)
 
     def refine(self, step: Step) -> RowUpdate | None:
-        """The change of the set of Gaussians that density control proposes, if any.
-
-        What changes the model without such a change (mcmc's noise) is taken back in a skipped iteration, which is made
-        again (`Engine.overflow`).
-        """
+        """The change of the set of Gaussians that density control proposes, if any. What changes the model without one
+        (mcmc's noise) is taken back in a skipped iteration, which is made again (`Engine.overflow`)."""
         due, overflow = self.density.event_due(step), self.engine.overflow
         if due:
             self.engine.complete(self.optimizer.moments, self.density.stats)
@@ -154,12 +148,9 @@ class Trainer(TrainingState):
         return self.engine.agreed(update) if due else update
 
     def follow(self, update: RowUpdate | None) -> None:
-        """Apply the change of the set of Gaussians that density control proposed, if any.
-
-        Model, optimizer and controller follow the change, with its rows sorted in space until `refine_until`. Not in
-        the paper: what stands right before a camera goes with any change; and the size of distant Gaussians is limited,
-        every `RESTRAIN_EVERY` iterations, also without a change.
-        """
+        """Apply the change of the set of Gaussians that density control proposed, if any, with its rows sorted in space
+        until `refine_until`. Not in the paper: what stands right before a camera goes with any change; and the size of
+        distant Gaussians is limited, every `RESTRAIN_EVERY` iterations, also without a change."""
         if update is not None:
             if self.clearance is not None:
                 update = self.clearance.clear(update, self.gaussians)
@@ -172,8 +163,8 @@ class Trainer(TrainingState):
 
 
 def require_samples(samples: PixelSamples, view_ids: Sequence[int], name: str) -> None:
-    """Raise `InputError` unless `samples` of the pixel sampler `name` are of these views, in this order: photos and
-    error maps of other views would be compared with renders of these."""
+    """Raise `InputError` unless `samples` of the pixel sampler `name` are of these views, in this order, whose renders
+    are compared with their photos and error maps."""
     if samples.view_ids != tuple(view_ids):
         raise InputError(
             f"pixel_sampler.type '{name}' returned samples of views {samples.view_ids}, asked for {tuple(view_ids)}: "

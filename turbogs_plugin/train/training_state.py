@@ -1,8 +1,5 @@
-"""What iterations of training change: the model, the error maps and the state of the strategies.
-
-`Trainer` makes the iterations. Here is what is done with their state as a whole: it is saved and loaded, made complete,
-taken back where an engine had too little memory, and shown. The first error maps are errors of the initial model.
-"""
+"""What iterations of training change: the model, the error maps and the state of the strategies; and what is done with
+it as a whole: it is begun, saved and loaded, made complete, taken back where an engine had too little memory, shown."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points, with_degree
 from turbogs_plugin.model.torch_file import read_gsplat
 from turbogs_plugin.plan.memory import cap_of
-from turbogs_plugin.plan.photo_gains import compare_exposures
+from turbogs_plugin.plan.photo_gains import PhotoGains, compare_exposures
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.agreement import require_agreement
 from turbogs_plugin.scene.geometry import evenly
@@ -47,8 +44,9 @@ class TrainingState:
         config: the run's, in which nothing is ``auto`` any more.
         scene: on any device.
         device: where everything is computed and kept.
-        resuming: a state is loaded next, so that the model of `train.init` need not be there.
         engine: does the computation.
+        gains: the photos', as a plan has compared them; None: compared here, where exposures are learnt.
+        resuming: a state is loaded next, so that the model of `train.init` need not be there.
 
     Attributes:
         gaussians: the model; iterations change it in place, so clone what is to be kept.
@@ -58,20 +56,32 @@ class TrainingState:
         iteration: how many are finished; `iterations` is T, and `refine_until` the last one of densification.
     """
 
-    def __init__(self, config: Config, scene: Scene, device: torch.device, resuming: bool, engine: Engine) -> None:
+    def __init__(
+        self,
+        config: Config,
+        scene: Scene,
+        device: torch.device,
+        engine: Engine,
+        gains: PhotoGains | None,
+        resuming: bool,
+    ) -> None:
         train = config.train
         self.config, self.engine, self.extent = config, engine, scene.extent
         self.views = place_views(scene.train, device, train.pixels_place)
         kind = OffloadedErrorMaps if train.pixels_place == "host" else ErrorMaps
         self.maps: ErrorMaps = kind(scene.train.cameras.sizes, device, config.maps.beta, masks=self.views.masks)
         self.background = Background.of(train.background, self.views.photos.transparent)
-        self.exposures = first_exposures(scene, resuming, device) if train.exposure else None
+        self.exposures: Exposures | None = None
+        if train.exposure:
+            self.exposures = Exposures.identity(len(self.views), device)
+            if not resuming:
+                set_gains(self.exposures, gains or compare_exposures(scene.train, scene.points))
         self.view_sampler = config.build("view_sampler")
         self.optimizer = config.build("optimizer")
         self.density = config.build("density")
         self.view_sampler.setup(self.views.cameras, scene.extent)
-        init = "points" if resuming else train.init
-        self.begin_with(initial_gaussians(scene, config, init).map(lambda tensor: tensor.to(device)))
+        gaussians = initial_gaussians(scene, config, "points" if resuming else train.init)
+        self.begin_with(gaussians.map(lambda tensor: tensor.to(device)))
         self.parameter_mean = ParameterMean(train.average_last, self.learnt()) if train.average_last else None
         self.set_length(int(train.iterations), train.refine_until)
         self.iteration = 0
@@ -158,16 +168,11 @@ class TrainingState:
 
     def repeat_lost(self, wait: bool = False) -> None:
         """Go back by the iterations that were skipped: where the engine has too little memory for an iteration, that
-        one and those after it change nothing until the engine is settled. They are made again, with views chosen anew.
+        one and those after it change nothing until the engine is settled. They are made again, with views chosen anew,
+        but for those before a change of the set of Gaussians, which would then be made twice.
 
-        Training never goes back past a change of the set of Gaussians, which would then be made twice: iterations
-        skipped just before such a change are lost.
-
-        Args:
-            wait: wait for the GPU, to know of all of them.
-
-        Raises:
-            InputError: an iteration has more intersections of a tile and a splat than a pass can have.
+        With `wait`, it waits for the GPU, to know of all of them. Raises `InputError` where an iteration has more
+        intersections of a tile and a splat than a pass can have.
         """
         lost, last = self.engine.settle(wait), self.iteration
         self.iteration = max(last - lost, min(self._earliest, last))
@@ -178,23 +183,14 @@ class TrainingState:
         self.engine.verify(self.state_dict)
 
     def require_finite(self) -> None:
-        """Stop a run whose model is lost.
-
-        Raises:
-            TrainingStopped: a parameter is not finite, which later iterations would not repair.
-        """
-        bad = int((~self.gaussians.finite_rows()).sum())
-        if bad:
-            raise TrainingStopped(
-                f"iteration {self.iteration}: {bad} of {len(self.gaussians)} Gaussians are not finite"
-            )
+        """Raise `TrainingStopped` where a parameter is not finite, which later iterations would not repair."""
+        if bad := int((~self.gaussians.finite_rows()).sum()):
+            count = len(self.gaussians)
+            raise TrainingStopped(f"iteration {self.iteration}: {bad} of {count} Gaussians are not finite")
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that iterations change, as plain tensors and numbers.
-
-        A resume from it is bit for bit the same on a CPU: there is no generator to save, as all randomness is a
-        function of (seed, iteration, place) (`turbogs_plugin.engine.reference.philox`).
-        """
+        """Everything that iterations change, as plain tensors and numbers. A resume from it is bit for bit the same on
+        a CPU: all randomness is a function of (seed, iteration, place) (`turbogs_plugin.engine.reference.philox`)."""
         return {
             "iteration": self.iteration,
             "initial_error": self.initial_error,
@@ -206,14 +202,9 @@ class TrainingState:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load what `state_dict` gave, of the same configuration and scene.
-
-        An untrusted state must first be compared with the present one (`checkpoint.require_like`). In a run with a time
-        budget, call `set_length` before.
-
-        Raises:
-            ValueError: the parts of the state do not fit each other, or not this trainer.
-        """
+        """Load what `state_dict` gave, of the same configuration and scene, after `set_length`. An untrusted state must
+        first be compared with the present one (`checkpoint.require_like`). Raises `ValueError` where its parts do not
+        fit each other, or not this trainer."""
         if not 0 <= state["iteration"] <= self.iterations or state["nonfinite_losses"] < 0:
             raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
         if state["maps"]["stamp_base"] > state["iteration"]:
@@ -231,28 +222,16 @@ class TrainingState:
             getattr(self, name).load_state_dict(state[name])
 
 
-def first_exposures(scene: Scene, resuming: bool, device: torch.device) -> Exposures:
-    """The gains by which the training photos differ where they show the same; a resumed run loads its own."""
-    views = scene.train
-    if resuming:
-        return Exposures.identity(len(views), device)
-    gains = compare_exposures(views, scene.points).gains  # [V, 3] of the channels, in stops
-    exposures, factors = Exposures.identity(len(gains), device), 2.0 ** torch.from_numpy(gains).double()  # [V, 3]
+def set_gains(exposures: Exposures, gains: PhotoGains) -> None:
+    """Begin with the gains by which photos differ where they show the same; their mean is the identity."""
+    factors = 2.0 ** torch.from_numpy(gains.gains).double()  # [V, 3]
     exposures.offsets[:, range(3), range(3)] = (factors / factors.mean(dim=0) - 1.0).to(exposures.offsets)
-    return exposures
 
 
 def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
-    """The model that training starts from: a given one, or one of the capture's or another cloud's points; and a
+    """The model, on the CPU, that training starts from by `init`, which is as `train.init`: a given one, or one of the
+    capture's or another cloud's points, of which as many as the cap allows are taken, evenly in their order; and a
     backdrop if one is wanted.
-
-    If there are more points than `density.max_gaussians` allows, as many as it allows are taken, evenly in their order.
-
-    Args:
-        init: as `train.init`.
-
-    Returns:
-        On the CPU.
 
     Raises:
         InputError: the given model cannot be read, given points are not of this capture, or the cap has no room.
@@ -264,21 +243,8 @@ def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
             f"density.max_gaussians {cap} leaves no room beside the {others} of the backdrop: allow more, or leave the "
             "backdrop out by train.backdrop=false"
         )
-    cloud = None if init in ("points", "random") else plain_cloud(init)
-    if init in ("points", "random") or cloud is not None:
-        points, colors = scene.points, scene.point_colors
-        if cloud is not None:
-            points, colors = (
-                torch.from_numpy(scene.frame.normalise_points(cloud[0])).float(),
-                torch.from_numpy(cloud[1]),
-            )
-            if not config.scene.force:
-                require_agreement(replace(scene, points=points, point_colors=colors, drawn_points=False))
-        elif init == "random":
-            cameras = scene.train.cameras
-            viewmats, Ks = cameras.viewmats.cpu().double().numpy(), cameras.Ks.cpu().double().numpy()
-            points = torch.from_numpy(starting_points(viewmats, Ks, cameras.sizes)[0]).float()
-            colors = colors_in_photos(points, scene.train.cameras, scene.train.photos, scene.train.masks)
+    if cloud := _cloud(scene, config, init):
+        points, colors = cloud
         rows = evenly(len(points), cap - others if cap else len(points))
         settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
         gaussians = gaussians_from_points(points[rows], colors[rows], *settings)
@@ -293,9 +259,25 @@ def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
             )
     if not train.backdrop:
         return gaussians
-    color = _mean_color(scene.train)
-    backdrop = backdrop_gaussians(color, train.sh_degree, scene.extent)
+    backdrop = backdrop_gaussians(_mean_color(scene.train), train.sh_degree, scene.extent)
     return Gaussians(**{name: torch.cat([tensor, getattr(backdrop, name)]) for name, tensor in gaussians.items()})
+
+
+def _cloud(scene: Scene, config: Config, init: str) -> tuple[Tensor, Tensor] | None:
+    """Points [M, 3] float32 and their colours [M, 3] uint8 to start from; None where `init` is a model."""
+    if init == "points":
+        return scene.points, scene.point_colors
+    views = scene.train
+    if init == "random":
+        viewmats, Ks = (each.cpu().double().numpy() for each in (views.cameras.viewmats, views.cameras.Ks))
+        points = torch.from_numpy(starting_points(viewmats, Ks, views.cameras.sizes)[0]).float()
+        return points, colors_in_photos(points, views.cameras, views.photos, views.masks)
+    if (cloud := plain_cloud(init)) is None:
+        return None
+    points, colors = torch.from_numpy(scene.frame.normalise_points(cloud[0])).float(), torch.from_numpy(cloud[1])
+    if not config.scene.force:
+        require_agreement(replace(scene, points=points, point_colors=colors, drawn_points=False))
+    return points, colors
 
 
 def _mean_color(views: PosedImages) -> Tensor:
