@@ -17,18 +17,20 @@ from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene import Photos, PosedImages
 from turbogs_plugin.types import Cameras
 
+AS_GSPLAT = "expected items as of gsplat's data sets"
+
 
 def read_items(trainset: Any, name: str, white: float, convert: Callable[[Tensor], Tensor]) -> list[dict[str, Any]]:
     """The items of a data set, by number, read by several threads.
 
     Args:
-        trainset: V items with "image" [H, W, 3], 0 .. `white`.
+        trainset: V items with "image" [H, W, 3], 0 .. `white`, and perhaps "mask" [H, W], True where a pixel counts.
         name: of the data set, for messages.
         convert: of an image, 0 .. 255, what is kept of it in its item.
 
     Raises:
         InputError: it has no items by number, or cuts random patches (``patch_size``); or an image is no tensor
-            [H, W, 3], or not within 0 .. `white`.
+            [H, W, 3], or not within 0 .. `white`; or a mask has another size.
     """
     if not (hasattr(trainset, "__len__") and hasattr(trainset, "__getitem__")) or not len(trainset):
         raise InputError(f"{name} is a {type(trainset).__name__}: expected a data set with items by number, no loader")
@@ -40,13 +42,14 @@ def read_items(trainset: Any, name: str, white: float, convert: Callable[[Tensor
 
     def read(number: int) -> dict[str, Any]:
         item, place = trainset[number], f"{name}[{number}]"
-        require_keys(
-            item if isinstance(item, dict) else {}, ("image",), place, "expected items as of gsplat's data sets"
-        )
-        image = item["image"]
+        require_keys(item if isinstance(item, dict) else {}, ("image",), place, AS_GSPLAT)
+        image, mask = item["image"], item.get("mask")
         if not isinstance(image, Tensor) or image.dim() != 3 or image.shape[-1] != 3:
             found = tuple(image.shape) if isinstance(image, Tensor) else type(image).__name__
             raise InputError(f"{place}['image'] is {found}: expected a tensor [H, W, 3], colours alone")
+        if mask is not None and tuple(mask.shape) != tuple(image.shape[:2]):
+            expected = f"{tuple(image.shape[:2])} as its image"
+            raise InputError(f"{place}['mask'] has shape {tuple(mask.shape)}: expected {expected}")
         low, high = (float(value) for value in image.aminmax())
         if not 0 <= low <= high <= white:
             raise InputError(f"{place}['image'] has values {low:g} .. {high:g}: expected 0 .. {white:g}; see white")
@@ -65,7 +68,7 @@ def posed_images(views: Any, white: float) -> PosedImages:
     items, cameras = read_items(views, "views", white, lambda image: image.round().to(torch.uint8).cpu()), []
     for number, item in enumerate(items):
         place = f"views[{number}]"
-        require_keys(item, ("K", "camtoworld"), place, "expected items as in gsplat's data sets")
+        require_keys(item, ("K", "camtoworld"), place, AS_GSPLAT)
         K, pose = (torch.as_tensor(item[key]).double().cpu() for key in ("K", "camtoworld"))
         for key, value, side in (("K", K, 3), ("camtoworld", pose, 4)):
             good = value.shape == (side, side) and bool(value.isfinite().all())
@@ -73,25 +76,22 @@ def posed_images(views: Any, white: float) -> PosedImages:
         turned = (pose[:3, :3] @ pose[:3, :3].T - torch.eye(3)).abs().max() < 1e-3
         require(bool(turned), f"{place}['camtoworld']", pose.tolist(), "a rotation and a place, without a scale")
         cameras.append((torch.linalg.inv(pose), K))
+    viewmats, Ks = (torch.stack(values).float() for values in zip(*cameras, strict=True))
     sizes = np.array([item["image"].shape[1::-1] for item in items], dtype=np.int64)
-    Ks = torch.stack([K for _, K in cameras]).float()
-    masks = masks_of(items, "views")
+    masks = masks_of(items)
     return PosedImages(
-        Cameras(torch.stack([viewmat for viewmat, _ in cameras]).float(), Ks, sizes),
+        Cameras(viewmats, Ks, sizes),
         tuple(map(str, range(len(items)))),
         Photos(torch.cat([item["image"].reshape(-1, 3) for item in items]), sizes),
         None if masks is None else PixelMasks.from_images(masks),
     )
 
 
-def masks_of(items: list[dict[str, Any]], name: str) -> list[Tensor] | None:
+def masks_of(items: list[dict[str, Any]]) -> list[Tensor] | None:
     """[H, W] bool of each item, True where a pixel counts; None where no item has a "mask"."""
-    for number, item in enumerate(items):
-        mask, shape = item.get("mask"), tuple(item["image"].shape[:2])
-        if mask is not None and tuple(mask.shape) != shape:
-            raise InputError(f"{name}[{number}]['mask'] has shape {tuple(mask.shape)}: expected {shape} as its image")
-    whole = (torch.ones(item["image"].shape[:2], dtype=torch.bool) for item in items)
     masks = [item.get("mask") for item in items]
     if all(mask is None for mask in masks):
         return None
-    return [every if mask is None else torch.as_tensor(mask).bool() for every, mask in zip(whole, masks, strict=True)]
+    everywhere = (torch.ones(item["image"].shape[:2], dtype=torch.bool) for item in items)
+    pairs = zip(everywhere, masks, strict=True)
+    return [every if mask is None else torch.as_tensor(mask).bool() for every, mask in pairs]
