@@ -293,5 +293,5 @@ def test_rows_removed_behind_its_back_are_refused():
         member.state[shorter] = member.state.pop(host.splats[name])
         member.param_groups[0]["params"] = [shorter]
         host.splats[name] = shorter
-    with pytest.raises(InputError, match=r"state 'exp_avg' of 'means' has shape \(40, 3\), expected \(7, 3\)"):
+    with pytest.raises(InputError, match=r"state 'exp_avg' of 'means' has shape \(40, 3\), not \(7, 3\)"):
         host.step(1)

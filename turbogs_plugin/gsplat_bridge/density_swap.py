@@ -84,10 +84,7 @@ class TurboDensityStrategy(DefaultStrategy):
 
     def _grow_gs(self, *arguments: Any, **options: Any) -> Any:
         """Private operations of `DefaultStrategy` that some hosts call: refused by name."""
-        raise InputError(
-            "TurboDensityStrategy has no _update_state, _grow_gs and _prune_gs: its step_post_backward does all three; "
-            "call that, or keep gsplat's DefaultStrategy"
-        )
+        raise InputError("call step_post_backward of TurboDensityStrategy, which has no _update_state or _grow_gs")
 
     _prune_gs = _update_state = _grow_gs
 
@@ -121,8 +118,7 @@ class TurboDensityStrategy(DefaultStrategy):
         Args:
             info: of the step's render; where it has several, of all of them. A host may also call this for one after
                 the other: then the first call refines, and what follows within that step no longer counts.
-            packed, host_options: not used, as `info` says itself whether it is packed.
-            scene: of gsplat from 1.6 on, a container with more arrays over Gaussians, whose rows follow.
+            packed, host_options: not used. scene: of gsplat from 1.6 on, a container with more arrays over Gaussians.
 
         Raises:
             InputError: the host trains in several processes; `state` is not one of `initialize_state`, or was not
@@ -164,10 +160,8 @@ class TurboDensityStrategy(DefaultStrategy):
             print(f"TurboDensityStrategy: {_ANNOUNCEMENTS[driven_by]}.")
             state.update(vars(GaussianStats.zeros(count, stats.view_counts.device)), driven_by=driven_by)
         if state["driven_by"] != driven_by:
-            raise InputError(
-                f"density control was {state['driven_by']}-driven so far, this step's info is {driven_by}-driven: put "
-                f"'{PREDICTION}' and '{GROUND_TRUTH}' into info at every step, or at none"
-            )
+            remedy = f"put '{PREDICTION}' and '{GROUND_TRUTH}' into info at every step, or at none"
+            raise InputError(f"density control was {state['driven_by']}-driven, now {driven_by}-driven: {remedy}")
         if not has_errors:
             # Ranked by what there is: the mean over views of the screen gradient takes the place of the mean error.
             stats.error_sums, stats.weight_sums = stats.grad_sums, stats.view_counts
@@ -178,10 +172,8 @@ class TurboDensityStrategy(DefaultStrategy):
             raise InputError("info['means2d'] has no absgrad: render with absgrad=True, or use absgrad=False here")
         for name in _STATS:
             if len(state[name]) != count:
-                raise InputError(
-                    f"state['{name}'] has {len(state[name])} rows, the parameters {count}: rows were added or removed "
-                    "without passing this state along"
-                )
+                remedy = "rows were added or removed without passing this state along"
+                raise InputError(f"state['{name}'] has {len(state[name])} rows, the parameters {count}: {remedy}")
         window = GaussianStats(**{name: state[name] for name in _STATS})
         add_stats(window, stats)
         state.update({key: state[name] for key, name in _AS_GSPLAT.items()})
@@ -189,17 +181,14 @@ class TurboDensityStrategy(DefaultStrategy):
 
     def _controller(self, step: int) -> ErrorDrivenDensity:
         """The controller with the present values of all fields."""
+        same = ("refine_every", "top_fraction", "max_gaussians", "prune_score_fraction", "opacity_decay")
         return ErrorDrivenDensity(
+            **{name: getattr(self, name) for name in same},
             refine_from=self.refine_start_iter + 1,
-            refine_every=self.refine_every,
             grad_threshold=self.grow_grad2d,
             absgrad_threshold=self.grow_absgrad2d,
-            top_fraction=self.top_fraction,
             percent_dense=self.grow_scale3d,
             split="long_axis",
-            max_gaussians=self.max_gaussians,
-            prune_score_fraction=self.prune_score_fraction,
-            opacity_decay=self.opacity_decay,
             final_keep=1.0,  # a host's run may end at any step
             prune_opacity=self.prune_opa,
             prune_world_size=self.prune_scale3d,

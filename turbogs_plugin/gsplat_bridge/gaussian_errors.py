@@ -55,15 +55,8 @@ def residuals(info: dict[str, Any]) -> Tensor | None:
 
 
 def iteration_stats(info: dict[str, Any], count: int) -> tuple[GaussianStats, bool]:
-    """The statistics of the pass that `info` tells of, after its backward pass; and whether they have error sums.
-
-    Args:
-        info: of a render whose ``means2d`` has its gradient; packed or not.
-        count: N.
-
-    Raises:
-        InputError: `info` lacks a key or a gradient, or is of another number of Gaussians.
-    """
+    """The statistics of the pass of N = `count` Gaussians that `info` tells of, packed or not, after its backward; and
+    whether they have error sums. Raises `InputError` where `info` lacks a key or a gradient, or is of another N."""
     stats = screen_statistics(info, count)
     if info.get(STATISTICS) is not None:  # with the screen gradients as the host left them: unscaled, say
         return replace(info[STATISTICS], grad_sums=stats.grad_sums, absgrad_sums=stats.absgrad_sums), True
@@ -116,10 +109,8 @@ def rows_of(info: dict[str, Any]) -> int | None:
 def _require_count(found: int, count: int) -> None:
     """Raise `InputError` where `info` is of another number of Gaussians than the parameters."""
     if found != count:
-        raise InputError(
-            f"info is of {found} Gaussians, the parameters are {count}: pass the info of this step's rasterization, "
-            "from before rows were added or removed"
-        )
+        remedy = "pass the info of this step's rasterization, from before rows were added or removed"
+        raise InputError(f"info is of {found} Gaussians, the parameters are {count}: {remedy}")
 
 
 def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
@@ -150,13 +141,10 @@ def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
 
 
 def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
-    """Sum over pixels of ``upstream * w`` for each Gaussian, by gsplat's rasterizer.
+    """[C, N, D], or [nnz, D] where packed: sum over pixels of ``upstream * w`` of each Gaussian, by gsplat's rasterizer.
 
     Args:
         info: of a pass of gsplat's `rasterization`. upstream: [C, H, W, D].
-
-    Returns:
-        [C, N, D], or [nnz, D] where packed.
     """
     from gsplat import rasterize_to_pixels
 

@@ -40,12 +40,8 @@ IN_IMAGES: dict[str, Any] = {
 
 
 def require_options(options: Any, nothing: Mapping[str, Any], swap: str) -> None:
-    """Raise `InputError` where the options of a host ask for something that has no effect with a swap.
-
-    Args:
-        options: with attributes, as gsplat's `Config`; None: there are none.
-        nothing: name of an option -> the value that asks for nothing.
-    """
+    """Raise `InputError` where the options of a host (as gsplat's `Config`, or None) ask for what has no effect with a
+    swap. nothing: name of an option -> the value that asks for nothing."""
     for name, value in nothing.items():
         if (found := getattr(options, name, value)) != value:
             raise InputError(f"{name}={found!r} does not work with {swap}: leave it out")
@@ -59,10 +55,8 @@ def require_one_process(swap: str) -> None:
     """
     distributed = torch.distributed
     if distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1:
-        raise InputError(
-            f"{swap} works in one process, this process group has {distributed.get_world_size()}: train on one GPU, or "
-            "keep gsplat's own part there"
-        )
+        count = distributed.get_world_size()
+        raise InputError(f"{swap} works in one process, this process group has {count}: train on one GPU")
 
 
 def require_keys(mapping: Mapping[str, Any] | Parameters | None, keys: Iterable[str], what: str, remedy: str) -> None:
@@ -98,10 +92,7 @@ def host_gaussians(params: Mapping[str, Tensor] | Parameters, names: Iterable[st
         value = params[name].detach()
         row = ROWS.get(name, (*value.shape[1:2], 3))
         if value.shape[:1] != (count,) or [size for size in value.shape[1:] if size != 1] != [s for s in row if s != 1]:
-            expected = ", ".join(map(str, ("N", *row)))
-            raise InputError(
-                f"parameter '{name}' has shape {tuple(value.shape)}: expected [{expected}] with N = {count} as in "
-                "'means'"
-            )
+            expected = f"[{', '.join(map(str, ('N', *row)))}] with N = {count} as in 'means'"
+            raise InputError(f"parameter '{name}' has shape {tuple(value.shape)}: expected {expected}")
         values[name] = value.view(count, *row)
     return Gaussians(**values)

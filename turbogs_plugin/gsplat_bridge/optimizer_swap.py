@@ -213,9 +213,9 @@ class MemberOptimizer(torch.optim.Optimizer):
                 state[COUNT] = torch.zeros(())
         for moment in MOMENTS:
             if state[moment].shape != parameter.shape:
+                found, remedy = tuple(state[moment].shape), "rows were added or removed without the optimizer"
                 raise InputError(
-                    f"optimizer state '{moment}' of '{self.name}' has shape {tuple(state[moment].shape)}, "
-                    f"expected {tuple(parameter.shape)}: rows were added or removed without the optimizer"
+                    f"state '{moment}' of '{self.name}' has shape {found}, not {tuple(parameter.shape)}: {remedy}"
                 )
         return state
 

@@ -15,7 +15,7 @@ from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.host import IN_IMAGES, require_options
-from turbogs_plugin.gsplat_bridge.host_views import masks_of, read_items
+from turbogs_plugin.gsplat_bridge.host_views import read_items
 from turbogs_plugin.strategies.protocols import SparseLoss
 from turbogs_plugin.types import LossOutput, PixelSamples, SamplingBudget, Step
 
@@ -36,16 +36,14 @@ def sparse_budget(num_views: int, batch_size: int | None = None, options: Any = 
         options: of the trainer, as gsplat's `Config`. Raises `InputError` for those that need whole images.
     """
     require_options(options, IN_IMAGES, "sparse pixels, which are no images")
-    whole = "a whole number, 1 or more"
-    require(isinstance(num_views, Integral) and num_views >= 1, "num_views", num_views, whole)
-    if batch_size is not None:
-        allowed = f"{whole} and at most num_views ({num_views})"
-        require(isinstance(batch_size, Integral) and 1 <= batch_size <= num_views, "batch_size", batch_size, allowed)
-    views = int(min(DEFAULT_VIEWS, num_views) if batch_size is None else batch_size)  # loaders refuse numpy's integers
+    require(isinstance(num_views, Integral) and num_views >= 1, "num_views", num_views, "a whole number, 1 or more")
+    views = min(DEFAULT_VIEWS, num_views) if batch_size is None else batch_size
+    allowed = f"a whole number, 1 or more and at most num_views ({num_views})"
+    require(isinstance(views, Integral) and 1 <= views <= num_views, "batch_size", views, allowed)
     rate = 1.0 / min(views, MOST_VIEWS)
     reason = "no batch_size is given" if batch_size is None else f"batch_size is {batch_size}"
     print(f"sparse_budget: {views} views a step, {rate:.0%} of the pixels of each ({reason}).")
-    return SamplingBudget(views, rate)
+    return SamplingBudget(int(views), rate)  # loaders refuse numpy's integers
 
 
 def maps_of_photos(
@@ -57,20 +55,19 @@ def maps_of_photos(
         trainset: as `read_items` takes it, numbered as the trainer's image_id. Where items have a "mask", samplers draw
             no other pixel.
     """
-    items = read_items(trainset, "trainset", white, lambda image: image.to(device).sum(dim=-1) / 255.0)
-    return ErrorMaps.from_images([item["image"] for item in items], masks_of(items))
+    items, masks = read_items(trainset, "trainset", white, lambda image: image.to(device).sum(dim=-1) / 255.0)
+    return ErrorMaps.from_images([item["image"] for item in items], masks)
 
 
 def gather_pixels(images: Tensor, samples: PixelSamples) -> Tensor:
     """[P, D] the pixels of images [C, H, W, D], one for each of the samples' views in their order; zero in empty slots.
     Differentiable."""
     check_samples(samples)
-    if not isinstance(images, Tensor):
-        raise InputError(f"images is a {type(images).__name__}: expected a tensor [C, H, W, D]")
+    shape = tuple(images.shape) if isinstance(images, Tensor) else type(images).__name__
     expected = [(int(height), int(width)) for width, height in samples.sizes]
-    if images.dim() != 4 or [tuple(images.shape[1:3])] * len(images) != expected:
+    if len(shape) != 4 or [shape[1:3]] * len(images) != expected:
         raise InputError(
-            f"images have shape {tuple(images.shape)}: expected [C, H, W, D] with H, W = {expected}, the images of the "
+            f"images have shape {shape}: expected a tensor [C, H, W, D] with H, W = {expected}, the images of the "
             "samples' views alone: images[view_ids] of those of all views"
         )
     flat = images.flatten(0, 2)  # [C * H * W, D]

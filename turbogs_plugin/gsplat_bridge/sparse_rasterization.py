@@ -86,8 +86,7 @@ def sparse_rasterization(
     require_one_process("sparse_rasterization")
     _check_options(gsplat_options)
     if render_mode not in RENDER_MODES:
-        supported = ", ".join(map(repr, RENDER_MODES))
-        raise InputError(f"sparse_rasterization: render_mode={render_mode!r} is not supported, only {supported}")
+        raise InputError(f"sparse_rasterization: render_mode={render_mode!r} is not supported, only {RENDER_MODES}")
     given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
     given |= {"viewmats": viewmats, "Ks": Ks} | ({} if backgrounds is None else {"backgrounds": backgrounds})
     _check_tensors(given, sh_degree)
@@ -154,14 +153,11 @@ def _check_tensors(given: dict[str, Tensor], sh_degree: int | None) -> None:
         if value.dtype not in (torch.float32, torch.float64):  # gradients of fewer bits come back not finite
             raise InputError(f"{name} is of {value.dtype}: expected torch.float32 or torch.float64")
         if (value.dtype, value.device) != (means.dtype, means.device):
-            raise InputError(
-                f"{name} is of {value.dtype} on {value.device}: expected {means.dtype} on {means.device} as means"
-            )
+            expected = f"{means.dtype} on {means.device} as means"
+            raise InputError(f"{name} is of {value.dtype} on {value.device}: expected {expected}")
         if name in ("viewmats", "Ks") and value.requires_grad and torch.is_grad_enabled():
-            raise InputError(
-                f"{name} requires a gradient, and cameras get none from sparse_rasterization: pass {name}.detach(), or "
-                "optimise the cameras with gsplat's rasterization"
-            )
+            remedy = f"pass {name}.detach(), or optimise the cameras with gsplat's rasterization"
+            raise InputError(f"{name} requires a gradient, and cameras get none from sparse_rasterization: {remedy}")
         if tuple(value.shape) != expected[name]:
             form = "[N, 3] without sh_degree" if name == "colors" and sh_degree is None else list(expected[name])
             raise InputError(f"{name} has shape {tuple(value.shape)}: expected {form} (N = {count}, C = {cameras})")

@@ -109,11 +109,11 @@ class TurboStep:
         require_one_process("TurboStep")
         require_options(options, WITHOUT_EFFECT, "TurboStep, whose step is its own")
         strategy = getattr(options, "strategy", None)
-        if not isinstance(strategy, DefaultStrategy | None):
+        if isinstance(strategy, DefaultStrategy):
+            strategy.refine_stop_iter = 0
+        elif strategy is not None:
             name = type(strategy).__name__
             raise InputError(f"strategy {name} would change the Gaussians beside TurboStep: use DefaultStrategy")
-        if strategy is not None:
-            strategy.refine_stop_iter = 0
         self.splats, self.optimizers, self.scene = splats, {} if optimizers is None else optimizers, scene
         gaussians = self._checked()
         device, degree = gaussians.device, gaussians.sh_degree
@@ -199,7 +199,7 @@ class TurboStep:
         self._follow(RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}))
 
     def _catch_up(self) -> None:
-        """Make the iterations again that had too little memory, until none is missing."""
+        """Make iterations that had too little memory again, until none is missing."""
         self.trainer.repeat_lost(wait=True)
         while self.trainer.iteration < self.steps:
             self.trainer.step()
@@ -230,10 +230,8 @@ class TurboStep:
             if ours is None or parameter.data_ptr() == ours.data_ptr():
                 continue
             if len(parameter) != len(ours):
-                raise InputError(
-                    f"splats['{name}'] has {len(parameter)} rows, and {len(ours)} after the last step: TurboStep adds "
-                    "and removes Gaussians itself; leave density control out, or begin a new TurboStep"
-                )
+                remedy = "TurboStep adds and removes Gaussians itself; leave density control out, or begin a new one"
+                raise InputError(f"splats['{name}'] has {len(parameter)} rows, not {len(ours)} as before: {remedy}")
             ours.copy_(parameter.detach().reshape(ours.shape))
             parameter.data = ours.view(parameter.shape)
 
@@ -244,14 +242,11 @@ class TurboStep:
             if parameter.dtype != torch.float32 and role_of(name, self.splats) in PARAMETER_NAMES:
                 raise InputError(f"splats['{name}'] is of {parameter.dtype}: expected torch.float32")
             if parameter.dim() == 0 or len(parameter) != len(gaussians):
-                raise InputError(
-                    f"splats['{name}'] has shape {tuple(parameter.shape)}: expected {len(gaussians)} rows, one a "
-                    "Gaussian, which can follow them; keep other parameters elsewhere"
-                )
+                expected = f"{len(gaussians)} rows, one a Gaussian; keep other parameters elsewhere"
+                raise InputError(f"splats['{name}'] has shape {tuple(parameter.shape)}: expected {expected}")
             if parameter.requires_grad and role_of(name, self.splats) not in {*self.optimizers, *PARAMETER_NAMES}:
-                raise InputError(
-                    f"splats['{name}'] is trained by an optimizer of the host: give optimizers, whose rows then follow"
-                )
+                remedy = "give optimizers, whose rows then follow"
+                raise InputError(f"splats['{name}'] is trained by an optimizer of the host: {remedy}")
         require(gaussians.shN.shape[1] in BANDS, "bands of shN", gaussians.shN.shape[1], f"among {BANDS}")
         require(len(gaussians) >= 2, "number of Gaussians", len(gaussians), "2 or more")
         return gaussians
