@@ -13,7 +13,6 @@ from helpers.optimizers import equal
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import TurboDensityStrategy, apply_row_update, sparse_rasterization
-from turbogs_plugin.gsplat_bridge.density_swap import GATES
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
@@ -34,16 +33,10 @@ def test_it_is_a_default_strategy_with_its_fields_and_hooks():
 
 
 def test_its_defaults_are_the_values_of_turbogs():
-    """Defaults equal `configs/turbogs.yaml` as a run takes it, but for the gates and the settings of our own scenes'
-    frame."""
-    section = load_config("turbogs").density
-    controller = vars(TurboDensityStrategy()._controller(0))
-    schedule = {"refine_from", "refine_every", "prune_size_from"}  # gsplat's, which its trainers scale
-    own_frame = {"prune_world_reference", "spare_beyond"}
-    tuned = {name: value for name, value in section.items() if name not in {"type", *schedule, *own_frame, *GATES}}
-    assert {name: controller[name] for name in tuned} == tuned
-    assert {name: controller[name] for name in GATES} == GATES
-    assert tuned["opacity_decay"] == TurboDensityStrategy().opacity_decay > ErrorDrivenDensity().opacity_decay
+    section, controller = load_config("turbogs").density, vars(TurboDensityStrategy()._controller(0))
+    for name in ("percent_dense", "split", "opacity_decay"):
+        assert controller[name] == section[name] != vars(ErrorDrivenDensity())[name]
+    assert controller["choose_by"] == "difficulty" and controller["final_keep"] == 1.0
 
 
 @dataclass
@@ -100,31 +93,15 @@ def test_schedule_events_happen_where_gsplats_do(monkeypatch):
 EVENT = 3
 """The step of the only event of `test_an_event_is_the_controllers`."""
 
-BASE = {
-    "refine_start_iter": 2,
-    "refine_every": 3,
-    "grow_grad2d": 0.02,
-    "grow_absgrad2d": 0.02,
-    "grow_scale3d": 0.17,
-    "top_fraction": 0.5,
-    "split": "sample",
-    "opacity_decay": 0.0,
-}
-BASE_OF_CONTROLLER = {
-    "refine_from": 3,
-    "refine_every": 3,
-    "grad_threshold": 0.02,
-    "absgrad_threshold": 0.02,
-    "percent_dense": 0.17,
-    "top_fraction": 0.5,
-    "final_keep": 1.0,
-}
+BASE = {"refine_start_iter": 2, "refine_every": 3, "grow_grad2d": 0.02, "grow_absgrad2d": 0.02, "grow_scale3d": 0.17}
+BASE |= {"top_fraction": 0.5, "opacity_decay": 0.0}
+BASE_OF_CONTROLLER = {"refine_from": 3, "refine_every": 3, "grad_threshold": 0.02, "absgrad_threshold": 0.02}
+BASE_OF_CONTROLLER |= {"percent_dense": 0.17, "top_fraction": 0.5, "final_keep": 1.0, "split": "long_axis"}
 """Settings of `ErrorDrivenDensity` by which the same happens as by `BASE`."""
 
 FIELDS = {"grow_grad2d": 0.001, "grow_absgrad2d": 0.05, "grow_scale3d": 0.2, "prune_opa": 0.4, "prune_scale3d": 0.16}
-FIELDS |= {"refine_every": 7, "top_fraction": 0.2, "lambda_base": 5.0, "score": "raw", "split": "sample"}
-FIELDS |= {"max_gaussians": 45, "prune_score_fraction": 0.3, "choose_by": "squares", "opacity_decay": 0.1}
-FIELDS |= {"final_every": 2, "final_keep": 0.7}
+FIELDS |= {"refine_every": 7, "top_fraction": 0.2, "max_gaussians": 45, "prune_score_fraction": 0.3}
+FIELDS |= {"opacity_decay": 0.1}
 """Field -> another value than its default."""
 
 RENAMED = {"grow_grad2d": "grad_threshold", "grow_absgrad2d": "absgrad_threshold", "grow_scale3d": "percent_dense"}
@@ -146,19 +123,17 @@ def test_fields_are_the_controllers_settings_whenever_they_change():
     assert [strategy._controller(step).prune_screen_size for step in (4, 5)] == [0.2, 0.0]
 
 
-def controlled(before, window, seed, extent):
+def controlled(before, window, extent):
     """The Gaussians after the event by an `ErrorDrivenDensity`, in the order of space."""
     controller = ErrorDrivenDensity(**BASE_OF_CONTROLLER)
     controller.setup(before)
     controller.load_state_dict({"stats": window})
-    step = Step(EVENT, 10**6, 14_999, seed, extent)
+    step = Step(EVENT, 10**6, 14_999, scene_extent=extent)
     return in_order_of_space(controller.update(before, step), before, step).apply(before)
 
 
 @pytest.mark.parametrize("tells_errors", [True, False])
-@pytest.mark.parametrize(
-    ("fields", "extent"), [({}, 1.0), ({"absgrad": False}, 1.0), ({}, 1.2), ({"seed": 7}, 1.0)], ids=str
-)
+@pytest.mark.parametrize(("fields", "extent"), [({}, 1.0), ({"absgrad": False}, 1.0), ({}, 1.2)], ids=str)
 def test_an_event_is_the_controllers(fields, extent, tells_errors):
     """What is no setting of the controller changes the event: with other values the controller does something else."""
     strategy = TurboDensityStrategy(**{**BASE, **fields})
@@ -182,25 +157,21 @@ def test_an_event_is_the_controllers(fields, extent, tells_errors):
         window |= {"error_sums": window["grad_sums"], "weight_sums": window["view_counts"]}
     without_absolute = {**window, "absgrad_sums": torch.zeros(40)}
     before = Gaussians(**{key: before[key] for key in PARAMETER_NAMES})
-    expected = controlled(before, window if strategy.absgrad else without_absolute, strategy.seed, extent)
+    expected = controlled(before, window if strategy.absgrad else without_absolute, extent)
     after = Gaussians(**{key: host.splats[key].detach() for key in PARAMETER_NAMES})
     for (key, value), (_, wanted) in zip(after.items(), expected.items(), strict=True):
         torch.testing.assert_close(value, wanted, msg=lambda text, key=key: f"{key}: {text}")
     assert all(len(host.state[key]) == len(after) and not host.state[key].any() for key in window)
     if fields or extent != 1.0:
-        assert not equal(after, controlled(before, window, 0, 1.0))
+        assert not equal(after, controlled(before, window, 1.0))
 
 
 def test_a_cap_holds_at_any_step():
     """A trainer may end at any step, so growth counts on no final pruning."""
-    fields = {"refine_start_iter": 1, "refine_every": 2, "refine_stop_iter": 9, "final_every": 3, "final_keep": 0.8}
     grows = {"grow_grad2d": 0.0, "grow_absgrad2d": 0.0, "top_fraction": 1.0, "prune_opa": 0.0, "prune_scale3d": 0.0}
-    strategy = TurboDensityStrategy(**{**BASE, **fields, **grows, "max_gaussians": 50})
-    host, counts = Host(strategy), []
-    for step in range(16):
-        host.step(step)
-        counts.append(len(host.splats["means"]))
-    assert counts[8] == max(counts) == 50 and counts[-1] < 50, counts
+    host = Host(TurboDensityStrategy(**{**BASE, **grows, "refine_stop_iter": 9, "max_gaussians": 50}))
+    counts = [len(host.splats["means"]) for step in range(10) if host.step(step)]
+    assert counts[6] == counts[9] == max(counts) == 50, counts
 
 
 @pytest.mark.parametrize("tells_errors", [False, True])
@@ -280,7 +251,7 @@ def test_changes_in_mid_run_are_refused():
     host = Host(TurboDensityStrategy(**SOON))
     host.step(0)
     host.tells_errors = True
-    with pytest.raises(InputError, match="was gradient-driven so far, this step's info is error-driven"):
+    with pytest.raises(InputError, match="was gradient-driven, now error-driven"):
         host.step(1)
     host = Host(TurboDensityStrategy(**SOON))
     host.step(0)
@@ -289,9 +260,7 @@ def test_changes_in_mid_run_are_refused():
         host.step(1)
 
 
-def test_squares_and_absgrad_must_be_there_or_off():
-    with pytest.raises(InputError, match=r"choose_by = 'squares' needs .*'prediction'.*or leave it at 'difficulty'"):
-        Host(TurboDensityStrategy(**SOON, choose_by="squares")).step(0)
+def test_absgrad_must_be_there_or_off():
     host = Host(TurboDensityStrategy(**SOON))
     host.step(0)
     del host.info["means2d"].absgrad
@@ -371,7 +340,7 @@ def test_several_renders_a_step(together):
 def test_private_operations_of_gsplats_strategy_are_refused_by_name():
     strategy = TurboDensityStrategy()
     for operation in (strategy._update_state, strategy._grow_gs, strategy._prune_gs):
-        with pytest.raises(InputError, match="its step_post_backward does all three"):
+        with pytest.raises(InputError, match="call step_post_backward of TurboDensityStrategy"):
             operation({}, {}, {}, 0, packed=False)
 
 

@@ -172,7 +172,7 @@ def test_a_member_that_never_has_a_part_is_named(made):
 
     for _ in range(MOST_SKIPPED if made else 0):
         iteration()
-    message = rf"of shN was left out, and {MOST_SKIPPED} iterations were skipped" if made else "no optimizer of scales"
+    message = rf"of shN was not stepped, like {MOST_SKIPPED} iterations" if made else "optimizers has no 'scales'"
     with pytest.raises(InputError, match=message):
         iteration()
 
@@ -181,7 +181,7 @@ def test_gradients_accumulated_in_one_member_are_refused():
     """Three of four iterations would be lost, though never many in a row."""
     splats, shared = make_splats(), SharedOptimizer(SparseAdam())
     members = {name: shared([{"params": splats[name], "name": name}]) for name in PARAMETER_NAMES}
-    with pytest.raises(InputError, match=r"of shN was left out, and 50 iterations were skipped for that, 16 made"):
+    with pytest.raises(InputError, match=r"of shN was not stepped, like 50 iterations, where 16 were made"):
         for step in range(100):
             set_gradients(splats, step)
             for name, member in members.items():
@@ -206,21 +206,6 @@ def test_a_host_without_harmonics_has_five_members():
             member.step()
         ends.append(params[next(iter(names))].detach())
     assert torch.equal(ends[0], ends[1]) and not torch.equal(ends[0], make_splats()["sh0"][:, 0])
-
-
-def test_closures_that_run_a_backward_each_give_one_update():
-    splats, expected = make_splats(), make_splats()
-    members, plain = members_of(splats, SparseAdam()), members_of(expected, SparseAdam())
-
-    def closure():
-        set_gradients(splats, 0)
-        return 3.0
-
-    assert [member.step(closure) for member in members.values()] == [3.0] * 6
-    set_gradients(expected, 0)
-    for member in plain.values():
-        member.step()
-    assert all(torch.equal(splats[name], expected[name]) for name in PARAMETER_NAMES)
 
 
 def saved_and_loaded(members):
@@ -262,12 +247,12 @@ def test_mistakes_are_named():
     members = members_of(splats, SparseAdam())
     set_gradients(splats, 0)
     members["means"].step()
-    with pytest.raises(InputError, match=r"'means' was stepped twice: expected, .* a step of quats, scales"):
+    with pytest.raises(InputError, match=r"'means' was stepped twice: expected a step of quats, scales"):
         members["means"].step()
     for name in PARAMETER_NAMES[1:-1]:
         members[name].step()
     members["shN"].param_groups[0]["betas"] = (0.8, 0.9)
-    with pytest.raises(InputError, match="betas differ between the members"):
+    with pytest.raises(InputError, match="betas and eps differ between the members"):
         members["shN"].step()
 
     for wrong in (SparseAdam, DenseAdam(), ADAM):
@@ -308,5 +293,5 @@ def test_rows_removed_behind_its_back_are_refused():
         member.state[shorter] = member.state.pop(host.splats[name])
         member.param_groups[0]["params"] = [shorter]
         host.splats[name] = shorter
-    with pytest.raises(InputError, match=r"state 'exp_avg' of 'means' has shape \(40, 3\), expected \(7, 3\)"):
+    with pytest.raises(InputError, match=r"state 'exp_avg' of 'means' has shape \(40, 3\), not \(7, 3\)"):
         host.step(1)

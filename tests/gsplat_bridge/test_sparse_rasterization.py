@@ -222,7 +222,7 @@ def test_gather_pixels(scene):
 
 REFUSED = [
     ({"packed": True}, r"packed=True is not supported, only False"),
-    ({"render_mode": "D"}, r"render_mode='D' is not supported, only 'RGB', 'ED', 'RGB\+ED'"),
+    ({"render_mode": "D"}, r"render_mode='D' is not supported, only \('RGB', 'ED', 'RGB\+ED'\)"),
     ({"pack": False}, r"no option 'pack': did you mean 'packed'"),
     ({"global_z_order": False}, r"global_z_order=False is not supported, only True"),
     ({"tile_size": 8}, r"tile_size=8 is not supported, only 16"),

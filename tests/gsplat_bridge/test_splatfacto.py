@@ -1,7 +1,7 @@
 """The recipe of docs/drop-in.md for nerfstudio's splatfacto, run as printed in stand-ins of its classes.
 
 Of splatfacto's shape: `features_dc` [N, 3] and `features_rest` [N, B, 3] for sh0 and shN, `opacities` [N, 1], a
-strategy made in `populate_modules`, hooks called by the model, and optimizers made from configurations.
+strategy made in `populate_modules`, and hooks called by the model.
 """
 
 import copy
@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 import torch
-import yaml
 from gsplat import DefaultStrategy
 from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
 
@@ -23,17 +22,6 @@ from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 
 DROP_IN = Path(__file__).resolve().parents[2] / "docs" / "drop-in.md"
 OURS = {"features_dc": "sh0", "features_rest": "shN"}
-
-
-@dataclass
-class AdamOptimizerConfig:
-    lr: float
-    eps: float = 1e-15
-    weight_decay: float = 0.0
-    _target: Any = torch.optim.Adam
-
-    def setup(self, params: list[torch.nn.Parameter]) -> torch.optim.Optimizer:
-        return self._target(params, lr=self.lr, eps=self.eps, weight_decay=self.weight_decay)
 
 
 @dataclass
@@ -85,8 +73,9 @@ class SplatfactoModel:
     def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: Any = None) -> dict[str, torch.Tensor]:
         return {"main_loss": (outputs["rgb"] - batch["image"]).abs().mean()}
 
-    def train(self, optimizers: dict[str, dict[str, Any]], steps: int) -> list[float]:
-        self.optimizers = {name: optimizers[name]["optimizer"].setup([p]) for name, p in self.gauss_params.items()}
+    def train(self, steps: int) -> list[float]:
+        rates = {name: RATES[OURS.get(name, name)] for name in self.gauss_params}
+        self.optimizers = {name: torch.optim.Adam([p], lr=rates[name]) for name, p in self.gauss_params.items()}
         batch, losses = {"image": torch.full((HEIGHT, WIDTH, 3), 0.5)}, []
         for step in range(steps):
             loss = self.get_loss_dict(self.get_outputs(step), batch)["main_loss"]
@@ -118,7 +107,7 @@ class VanillaPipeline(torch.nn.Module):
 
 @pytest.fixture
 def recipe() -> dict[str, Any]:
-    """The names that the documentation's blocks make: the classes, and `optimizers` with members."""
+    """The classes that the documentation's blocks make."""
     section = DROP_IN.read_text(encoding="utf-8").split("## Nerfstudio's splatfacto")[1].split("\n## ")[0]
     names: dict[str, Any] = {
         "SplatfactoModel": SplatfactoModel,
@@ -127,7 +116,6 @@ def recipe() -> dict[str, Any]:
         "TurboStep": TurboStep,
         "torch": torch,
         "TurboDensityStrategy": TurboDensityStrategy,
-        "optimizers": configurations(),
     }
     for block in re.findall(r"^```python\n(.*?)^```$", section, re.DOTALL | re.MULTILINE):
         exec(block, names)
@@ -150,37 +138,14 @@ def test_the_whole_step_and_a_resume_through_the_pipelines_state(recipe):
         assert torch.equal(pipelines[1].model.gauss_params[name], value), name
 
 
-def test_the_optimizers_configuration_is_written_and_read(recipe):
-    """As nerfstudio writes and reads a run's config.yml; the members of a model share one update, those of the next
-    another."""
-    read = yaml.load(yaml.dump(recipe["optimizers"]), Loader=yaml.Loader)
-    assert read == recipe["optimizers"]
-    models = []
-    for optimizers in (read, recipe["optimizers"]):
-        params = {OURS.get(name, name): value for name, value in make_splats().items()}
-        params = {name: torch.nn.Parameter(params[OURS.get(name, name)].detach()) for name in optimizers}
-        models.append([optimizers[name]["optimizer"].setup(params=[value]) for name, value in params.items()])
-    first, second = (members[0].shared for members in models)
-    assert first is not second and all(member.shared is first for member in models[0])
-    assert len(first.members) == len(second.members) == 6
-    assert [member.param_groups[0]["lr"] for member in models[0]] == [each["optimizer"].lr for each in read.values()]
-
-
-def configurations() -> dict[str, dict[str, Any]]:
-    keys = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
-    return {key: {"optimizer": AdamOptimizerConfig(RATES[OURS.get(key, key)])} for key in keys}
-
-
-@pytest.mark.parametrize("ours", [False, True])
-def test_splatfacto_trains_with_the_recipe(recipe, ours, capsys):
+def test_splatfacto_trains_with_the_recipe(recipe, capsys):
     model = recipe["TurboSplatfactoModel"]()
     model.populate_modules()
     shapes = {name: value.shape[1:] for name, value in model.gauss_params.items()}
-    losses = model.train(recipe["optimizers"] if ours else configurations(), 12)
-    said = capsys.readouterr().out
+    losses = model.train(12)
     count = len(model.gauss_params["means"])
     assert losses[2] < losses[0]  # nothing is refined, and no opacity decays, before step 3
-    assert count > 40 and "error-driven" in said and "steps are" not in said
+    assert count > 40 and "error-driven" in capsys.readouterr().out
     for name, parameter in model.gauss_params.items():
         (group,) = model.optimizers[name].param_groups
         assert parameter.shape == (count, *shapes[name]) and group["params"][0] is parameter

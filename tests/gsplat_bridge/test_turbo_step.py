@@ -171,7 +171,7 @@ def test_steps_states_and_rows_that_do_not_fit_are_refused():
     assert_refused("state.max_steps = 20", turbo.load_state_dict, state | {"max_steps": 20})
     assert_refused("the state does not fit", turbo.load_state_dict, {"steps": 3})
     turbo.splats["means"] = torch.nn.Parameter(torch.zeros(41, 3))
-    assert_refused(r"splats\['means'\] has 41 rows, and 40 after the last step", turbo.step, 1)
+    assert_refused(r"splats\['means'\] has 41 rows, not 40 as before", turbo.step, 1)
 
 
 def test_our_length():

@@ -10,8 +10,8 @@
 from turbogs_plugin import lazy_face
 from turbogs_plugin.gsplat_bridge.density_swap import TurboDensityStrategy, apply_row_update
 from turbogs_plugin.gsplat_bridge.optimizer_swap import SharedOptimizer
-from turbogs_plugin.gsplat_bridge.sparse_rasterization import gather_pixels, sparse_loss, sparse_rasterization
-from turbogs_plugin.gsplat_bridge.sparse_setup import maps_of_photos, sparse_budget
+from turbogs_plugin.gsplat_bridge.sparse_pixels import gather_pixels, maps_of_photos, sparse_budget, sparse_loss
+from turbogs_plugin.gsplat_bridge.sparse_rasterization import sparse_rasterization
 
 __all__ = [
     "SharedOptimizer",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -17,7 +17,6 @@ from turbogs_plugin.gsplat_bridge.host import (
     GEOMETRY,
     GROUND_TRUTH,
     PREDICTION,
-    STATISTICS,
     Optimizers,
     Parameters,
     host_gaussians,
@@ -27,39 +26,13 @@ from turbogs_plugin.gsplat_bridge.host import (
 )
 from turbogs_plugin.gsplat_bridge.optimizer_swap import COUNT, MemberOptimizer
 from turbogs_plugin.model.row_order import in_order_of_space
-from turbogs_plugin.strategies.density.error_driven import FINAL_PRUNINGS, ErrorDrivenDensity
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.rows import add_stats
 from turbogs_plugin.types import GaussianStats, RowUpdate, Step
-from turbogs_plugin.yaml_json import read_named_yaml
 
-TUNED: dict[str, dict[str, Any]] = {
-    section: {name: value for name, value in settings.items() if name != "type"}
-    for section, settings in read_named_yaml("turbogs", "turbogs_plugin.configs", "config").items()
-}
-"""Section -> settings of `configs/turbogs.yaml`, the defaults of what is swapped into a trainer."""
-
-GATES = {
-    "choose_by": "difficulty",
-    "prune_score_fraction": 0.0,
-    "top_fraction": 0.9,
-    "grad_threshold": 2e-4,
-    "absgrad_threshold": 2e-4,
-    "final_keep": 1.0,
-}
-"""Settings in place of turbogs' draw by squares, which gsplat's rasterization does not give, and of final pruning. The
-numbers of docs/drop-in.md were measured with them."""
-
-TUNED_DENSITY = ErrorDrivenDensity(**TUNED["density"] | GATES)
-"""Density control with the settings of `configs/turbogs.yaml`, but for `GATES`."""
-
-_STATS = tuple(field.name for field in fields(GaussianStats))
-_DRIVEN_BY = "driven_by"
-_STATE_KEYS = ("scene_scale", _DRIVEN_BY, *_STATS)
+_STATS = tuple(GaussianStats.__dataclass_fields__)
 _AS_GSPLAT = {"grad2d": "grad_sums", "count": "view_counts"}
 """Keys that gsplat's state has for the same sums."""
-_SUMS = {*_STATS, *_AS_GSPLAT}
-_REFINED = "refined"
-
 _ANNOUNCEMENTS = {
     "error": f"error-driven, by info['{PREDICTION}'] and info['{GROUND_TRUTH}']",
     "gradient": f"info has no '{PREDICTION}' and '{GROUND_TRUTH}', so Gaussians are ranked by screen gradients; "
@@ -71,16 +44,10 @@ _ANNOUNCEMENTS = {
 class TurboDensityStrategy(DefaultStrategy):
     """`ErrorDrivenDensity` behind the protocol of gsplat's strategies.
 
-    A subclass of `DefaultStrategy`, since trainers branch on that. Fields of `DefaultStrategy` keep their meaning:
-    refine_start_iter, refine_stop_iter, refine_every, prune_opa, grow_grad2d, grow_scale3d, prune_scale3d, and
-    prune_scale2d where refine_scale2d_stop_iter is above 0; any of them may change at any time. Opacities are never
-    reset; reset_every only says when pruning by size begins. grow_scale2d has no effect. The fields below are named and
-    meant as in `ErrorDrivenDensity`.
-
-    The defaults are the values of `configs/turbogs.yaml`, read from there, also for grow_scale3d. But who grows is
-    gated by gradients (`GATES`), where turbogs draws by squares. When and how often is refined stays gsplat's, as
-    trainers scale those fields. `prune_world_reference` and `spare_beyond` are left out: they hold where the origin is
-    the cameras' centre and a backdrop stands behind the scene.
+    A subclass of `DefaultStrategy`, since trainers branch on that. Its fields keep their meaning, and may change at any
+    time. Opacities are never reset; reset_every only says when pruning by size begins. grow_scale2d has no effect. The
+    fields below are meant as in `ErrorDrivenDensity`. Their defaults are values of `configs/turbogs.yaml`, but for who
+    grows and goes: there by squares, which gsplat's rasterization does not give.
 
     Once a line ``info.update(prediction=colors, ground_truth=pixels)`` stands before ``loss.backward()``, Gaussians are
     ranked by the error they carry (see `gaussian_errors`); without it, by their screen gradients. The first step prints
@@ -90,28 +57,17 @@ class TurboDensityStrategy(DefaultStrategy):
         absgrad: also densify by absolute gradients above grow_absgrad2d; render with ``absgrad=True`` then.
         grow_grad2d, grow_absgrad2d, grow_scale3d: grad_threshold, absgrad_threshold and percent_dense of
             `ErrorDrivenDensity`.
-        choose_by: `squares`, turbogs' own, needs the line above, and that `sparse_rasterization` renders; set
-            grow_absgrad2d and prune_score_fraction to turbogs' values with it.
-        max_gaussians: never more, at any step, as the end of the run is not known.
-        final_every, final_keep: final pruning after refine_stop_iter, three times at most; off where final_keep is 1.
-        seed: decides the positions of split Gaussians.
+        max_gaussians: never more, at any step.
     """
 
-    grow_grad2d: float = TUNED_DENSITY.grad_threshold
-    grow_scale3d: float = TUNED_DENSITY.percent_dense
+    grow_grad2d: float = 2e-4
+    grow_scale3d: float = 0.0033
     absgrad: bool = True
-    grow_absgrad2d: float = TUNED_DENSITY.absgrad_threshold
-    lambda_base: float = TUNED_DENSITY.lambda_base
-    score: Literal["balanced", "raw"] = TUNED_DENSITY.score
-    top_fraction: float = TUNED_DENSITY.top_fraction
-    split: Literal["sample", "long_axis"] = TUNED_DENSITY.split
-    max_gaussians: int = TUNED_DENSITY.max_gaussians
-    prune_score_fraction: float = TUNED_DENSITY.prune_score_fraction
-    choose_by: Literal["difficulty", "squares"] = TUNED_DENSITY.choose_by
-    opacity_decay: float = TUNED_DENSITY.opacity_decay
-    final_every: int = TUNED_DENSITY.final_every
-    final_keep: float = TUNED_DENSITY.final_keep
-    seed: int = 0
+    grow_absgrad2d: float = 2e-4
+    top_fraction: float = 0.9
+    max_gaussians: int = 0
+    prune_score_fraction: float = 0.0
+    opacity_decay: float = 0.4
 
     def __post_init__(self) -> None:
         require(not self.revised_opacity, "revised_opacity", self.revised_opacity, "False: splits copy the opacity")
@@ -124,14 +80,11 @@ class TurboDensityStrategy(DefaultStrategy):
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """The running state, to be passed to both hooks: `GaussianStats`' tensors by name, once the first step made
         them, so that gsplat's own operations carry them along."""
-        return {"scene_scale": scene_scale, _DRIVEN_BY: None, **dict.fromkeys((_REFINED, *_STATS, *_AS_GSPLAT))}
+        return {"scene_scale": scene_scale, **dict.fromkeys(("driven_by", "refined", *_STATS, *_AS_GSPLAT))}
 
     def _grow_gs(self, *arguments: Any, **options: Any) -> Any:
         """Private operations of `DefaultStrategy` that some hosts call: refused by name."""
-        raise InputError(
-            "TurboDensityStrategy has no _update_state, _grow_gs and _prune_gs: its step_post_backward does all three; "
-            "call that, or keep gsplat's DefaultStrategy"
-        )
+        raise InputError("call step_post_backward of TurboDensityStrategy, which has no _update_state or _grow_gs")
 
     _prune_gs = _update_state = _grow_gs
 
@@ -165,37 +118,31 @@ class TurboDensityStrategy(DefaultStrategy):
         Args:
             info: of the step's render; where it has several, of all of them. A host may also call this for one after
                 the other: then the first call refines, and what follows within that step no longer counts.
-            packed, host_options: what hosts hand to their own strategies; not used. `info` says itself whether it is
-                packed.
-            scene: of gsplat from 1.6 on, a container with more arrays over Gaussians, whose rows follow.
+            packed, host_options: not used. scene: of gsplat from 1.6 on, a container with more arrays over Gaussians.
 
         Raises:
             InputError: the host trains in several processes; `state` is not one of `initialize_state`, or was not
-                carried along when rows changed; `info` lacks a key, or sums that `choose_by` needs; or it
-                changed between having errors and none.
+                carried along when rows changed; `info` lacks a key, or changed between having errors and none.
         """
         require_one_process("TurboDensityStrategy")
-        if step - self.refine_stop_iter + 1 > (0 if self.final_keep == 1 else FINAL_PRUNINGS * self.final_every):
+        if step >= self.refine_stop_iter:
             return
         gaussians = host_gaussians(params, GEOMETRY)
         infos = [info] if isinstance(info, dict) else info
-        if state is not None and state.get(_REFINED) == step:
+        if state is not None and state.get("refined") == step:
             infos = [each for each in infos if rows_of(each) in (None, len(gaussians))]
         for each in infos:
             window = self._accumulate(state, each, len(gaussians))
-        if not infos or not self._due(step):
+        if not infos or step <= self.refine_start_iter or step % self.refine_every:
             return
         controller = self._controller(step)
-        controller.setup(gaussians)
-        controller.load_state_dict({"stats": vars(window)})
-        # The end of the run is not known here: another interval is taken to be left, so that this step may prune, but
-        # no later pruning is counted on. `max_gaussians` holds at any step.
-        now = Step(step, step + self.final_every, self.refine_stop_iter - 1, self.seed, state["scene_scale"])
-        update = controller.update(gaussians, now)
-        window.zero_()
+        controller.stats = window
+        stop = self.refine_stop_iter
+        now = Step(step, stop, stop - 1, scene_extent=state["scene_scale"])
+        update = controller.update(gaussians, now)  # zeroes the window
         if update is None:
             return
-        state[_REFINED] = step
+        state["refined"] = step
         apply_row_update(in_order_of_space(update, gaussians, now), params, optimizers, state, scene)
         if self.verbose:
             print(
@@ -205,24 +152,16 @@ class TurboDensityStrategy(DefaultStrategy):
 
     def _accumulate(self, state: dict[str, Any], info: dict[str, Any], count: int) -> GaussianStats:
         """Add this iteration's statistics to those in `state`; returns the latter."""
-        if state is None:
-            raise InputError("the strategy was called without its state: pass the dict of strategy.initialize_state()")
-        require_keys(state, _STATE_KEYS, "the state", "expected the dict from TurboDensityStrategy.initialize_state()")
+        remedy = "pass the dict of TurboDensityStrategy.initialize_state()"
+        require_keys(state, ("scene_scale", "driven_by", *_STATS), "the state", remedy)
         stats, has_errors = iteration_stats(info, count)
-        if self.choose_by == "squares" and info.get(STATISTICS) is None:
-            raise InputError(
-                f"choose_by = 'squares' needs the sums that sparse_rasterization leaves where info has "
-                f"'{PREDICTION}' and '{GROUND_TRUTH}': render with it and add them, or leave it at 'difficulty'"
-            )
         driven_by = "error" if has_errors else "gradient"
-        if state[_DRIVEN_BY] is None:
+        if state["driven_by"] is None:
             print(f"TurboDensityStrategy: {_ANNOUNCEMENTS[driven_by]}.")
-            state[_DRIVEN_BY] = driven_by
-        if state[_DRIVEN_BY] != driven_by:
-            raise InputError(
-                f"density control was {state[_DRIVEN_BY]}-driven so far, this step's info is {driven_by}-driven: put "
-                f"'{PREDICTION}' and '{GROUND_TRUTH}' into info at every step, or at none"
-            )
+            state.update(vars(GaussianStats.zeros(count, stats.view_counts.device)), driven_by=driven_by)
+        if state["driven_by"] != driven_by:
+            remedy = f"put '{PREDICTION}' and '{GROUND_TRUTH}' into info at every step, or at none"
+            raise InputError(f"density control was {state['driven_by']}-driven, now {driven_by}-driven: {remedy}")
         if not has_errors:
             # Ranked by what there is: the mean over views of the screen gradient takes the place of the mean error.
             stats.error_sums, stats.weight_sums = stats.grad_sums, stats.view_counts
@@ -231,43 +170,26 @@ class TurboDensityStrategy(DefaultStrategy):
             stats.absgrad_sums = torch.zeros_like(stats.absgrad_sums)
         elif getattr(info["means2d"], "absgrad", None) is None:
             raise InputError("info['means2d'] has no absgrad: render with absgrad=True, or use absgrad=False here")
-        if state[_STATS[0]] is None:
-            state.update(vars(GaussianStats.zeros(count, stats.view_counts.device)))
         for name in _STATS:
             if len(state[name]) != count:
-                raise InputError(
-                    f"state['{name}'] has {len(state[name])} rows, the parameters {count}: rows were added or removed "
-                    "without passing this state along"
-                )
+                remedy = "rows were added or removed without passing this state along"
+                raise InputError(f"state['{name}'] has {len(state[name])} rows, the parameters {count}: {remedy}")
         window = GaussianStats(**{name: state[name] for name in _STATS})
         add_stats(window, stats)
         state.update({key: state[name] for key, name in _AS_GSPLAT.items()})
         return window
 
-    def _due(self, step: int) -> bool:
-        """True at a step with a densification or a final pruning, at gsplat's places in the schedule."""
-        if step < self.refine_stop_iter:
-            return step > self.refine_start_iter and step % self.refine_every == 0
-        return (step - self.refine_stop_iter + 1) % self.final_every == 0
-
     def _controller(self, step: int) -> ErrorDrivenDensity:
         """The controller with the present values of all fields."""
+        same = ("refine_every", "top_fraction", "max_gaussians", "prune_score_fraction", "opacity_decay")
         return ErrorDrivenDensity(
+            **{name: getattr(self, name) for name in same},
             refine_from=self.refine_start_iter + 1,
-            refine_every=self.refine_every,
-            lambda_base=self.lambda_base,
-            score=self.score,
-            top_fraction=self.top_fraction,
-            split=self.split,
-            max_gaussians=self.max_gaussians,
-            prune_score_fraction=self.prune_score_fraction,
-            choose_by=self.choose_by,
-            opacity_decay=self.opacity_decay,
-            final_every=self.final_every,
-            final_keep=self.final_keep,
             grad_threshold=self.grow_grad2d,
             absgrad_threshold=self.grow_absgrad2d,
             percent_dense=self.grow_scale3d,
+            split="long_axis",
+            final_keep=1.0,  # a host's run may end at any step
             prune_opacity=self.prune_opa,
             prune_world_size=self.prune_scale3d,
             prune_screen_size=self.prune_scale2d if step < self.refine_scale2d_stop_iter else 0.0,
@@ -290,11 +212,9 @@ def apply_row_update(
     count = len(params["means"])
     for name, parameter in [*params.items()]:
         role = role_of(name, params)
-        if role in update.values:
-            value = update.values[role].reshape(-1, *parameter.shape[1:])  # a host's own layout
-        else:
-            value = parameter.detach()[update.source]
-        replaced = torch.nn.Parameter(value, requires_grad=parameter.requires_grad)
+        value = update.values[role] if role in update.values else parameter.detach()[update.source]
+        # In a host's own layout.
+        replaced = torch.nn.Parameter(value.reshape(-1, *parameter.shape[1:]), requires_grad=parameter.requires_grad)
         params[name] = replaced
         if name in optimizers:
             optimizer = optimizers[name]
@@ -308,7 +228,8 @@ def apply_row_update(
                 group["params"] = [replaced]
     for key, value in state.items():  # as by gsplat's operations, a host's own values go from parent to child
         if _of_rows(value, count):
-            state[key] = update.apply_state(value) if key in _SUMS else value[update.source]
+            ours = key in _STATS or key in _AS_GSPLAT
+            state[key] = update.apply_state(value) if ours else value[update.source]
     if scene is not None:  # any choice of rows is a copy of them behind the old ones, which then go
         scene.on_duplicate(update.source)
         scene.on_remove(torch.arange(count + len(update.source), device=update.source.device) < count)

@@ -6,8 +6,8 @@ Three sources, best first:
 2. gsplat's rasterizer, and prediction and ground truth in `info`: the *zero channel*. Colour channels that are zero
    everywhere, with the pixel error as their upstream gradient, have the sum of e * w as the gradient of their values,
    w = T * alpha the compositing weight; with 1 upstream, the sum of w. No other gradient is touched. The zero channel
-   costs one further pass over the tiles, of three channels: gsplat may be built for chosen numbers of channels, and
-   always has a colour's. The distance sums stay zero: no upstream gradient gives them.
+   costs one further pass over the tiles, of three channels, as gsplat may be built for chosen numbers of channels and
+   always has a colour's. The distance sums stay zero.
 3. Neither: there is no error, only the gradient on the screen.
 """
 
@@ -28,11 +28,10 @@ WITHOUT_GRADIENT = (
     "TurboDensityStrategy and the errors for MomentLMOptimizer need it; render without these options, or keep gsplat's "
     "MCMCStrategy"
 )
+RENDERED = "pass what the rasterization returned"
 
 ERROR_SUMS = "error_sums"
 """Key of `info` under which the sums of the zero channel, [N, 2], stay for whoever asks for them second."""
-
-_INTERSECTION = ("gaussian_ids", "conics", "opacities", "width", "height", "tile_size", "isect_offsets", "flatten_ids")
 
 
 def residuals(info: dict[str, Any]) -> Tensor | None:
@@ -56,19 +55,8 @@ def residuals(info: dict[str, Any]) -> Tensor | None:
 
 
 def iteration_stats(info: dict[str, Any], count: int) -> tuple[GaussianStats, bool]:
-    """The statistics of the pass that `info` tells of, after its backward pass.
-
-    Args:
-        info: of a render whose ``means2d`` has its gradient; packed or not.
-        count: N.
-
-    Returns:
-        The statistics, and whether they have error sums (then also weight sums).
-
-    Raises:
-        InputError: `info` lacks a key or a gradient, or is of another number of Gaussians.
-    """
-    require_keys(info, ("means2d",), "info", "pass what the rasterization returned")
+    """The statistics of the pass of N = `count` Gaussians that `info` tells of, packed or not, after its backward; and
+    whether they have error sums. Raises `InputError` where `info` lacks a key or a gradient, or is of another N."""
     stats = screen_statistics(info, count)
     if info.get(STATISTICS) is not None:  # with the screen gradients as the host left them: unscaled, say
         return replace(info[STATISTICS], grad_sums=stats.grad_sums, absgrad_sums=stats.absgrad_sums), True
@@ -106,11 +94,10 @@ def _error_sums(info: dict[str, Any], count: int) -> Tensor | None:
         )
     ones = torch.ones_like(errors)
     sums = zero_channel_sums(info, torch.stack([errors, ones, torch.zeros_like(ones)], dim=-1))[..., :2]
-    ids = info["gaussian_ids"]
-    if ids is None:
+    if info["gaussian_ids"] is None:
         info[ERROR_SUMS] = sums.reshape(-1, count, 2).sum(dim=0)
     else:
-        info[ERROR_SUMS] = sums.new_zeros(count, 2).index_add(0, ids.long(), sums)
+        info[ERROR_SUMS] = sums.new_zeros(count, 2).index_add(0, info["gaussian_ids"].long(), sums)
     return info[ERROR_SUMS]
 
 
@@ -122,17 +109,14 @@ def rows_of(info: dict[str, Any]) -> int | None:
 def _require_count(found: int, count: int) -> None:
     """Raise `InputError` where `info` is of another number of Gaussians than the parameters."""
     if found != count:
-        raise InputError(
-            f"info is of {found} Gaussians, the parameters are {count}: pass the info of this step's rasterization, "
-            "from before rows were added or removed"
-        )
+        remedy = "pass the info of this step's rasterization, from before rows were added or removed"
+        raise InputError(f"info is of {found} Gaussians, the parameters are {count}: {remedy}")
 
 
 def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
     """Sums of screen gradients, of views and largest radii, in gsplat's units; the sums over pixels stay zero."""
-    keys = ("means2d", "radii", "width", "height", "n_cameras", "gaussian_ids")
-    require_keys(info, keys, "info", "pass what the rasterization returned")
-    means2d, radii = info["means2d"], info["radii"]
+    require_keys(info, ("means2d", "radii", "width", "height", "n_cameras", "gaussian_ids"), "info", RENDERED)
+    means2d, radii, ids = info["means2d"], info["radii"], info["gaussian_ids"]
     if radii.dim() < means2d.dim():  # before gsplat 1.5 both axes have one radius
         radii = radii[..., None]
     if means2d.grad is None:
@@ -143,49 +127,40 @@ def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
     norms = [(means2d.grad * half).norm(dim=-1).float()]
     absolute = getattr(means2d, "absgrad", None)
     norms.append(torch.zeros_like(norms[0]) if absolute is None else (absolute * half).norm(dim=-1).float())
-    visible = (radii > 0).all(dim=-1)
-    if info["gaussian_ids"] is not None:  # packed
-        ids = info["gaussian_ids"].long()
-    else:
+    if ids is None:
+        visible = (radii > 0).all(dim=-1)
         _require_count(visible.shape[-1], count)
         ids = torch.where(visible)[-1]
         norms, radii = [norm[visible] for norm in norms], radii[visible]
-    stats = GaussianStats.zeros(count, means2d.device)
+    stats, ids = GaussianStats.zeros(count, means2d.device), ids.long()
     stats.grad_sums.index_add_(0, ids, norms[0])
     stats.absgrad_sums.index_add_(0, ids, norms[1])
     stats.view_counts.index_add_(0, ids, torch.ones_like(norms[0]))
-    largest = radii.amax(dim=-1).float() / max(width, height)
-    stats.max_radii.scatter_reduce_(0, ids, largest, "amax")
+    stats.max_radii.scatter_reduce_(0, ids, radii.amax(dim=-1).float() / max(width, height), "amax")
     return stats
 
 
 def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
-    """Sum over pixels of ``upstream * w`` for each Gaussian, by gsplat's rasterizer.
+    """[C, N, D], or [nnz, D] where packed: sum over pixels of ``upstream * w`` of each Gaussian, by gsplat's rasterizer.
 
     Args:
-        info: of a pass of gsplat's `rasterization`.
-        upstream: [C, H, W, D].
-
-    Returns:
-        [C, N, D], or [nnz, D] where packed.
+        info: of a pass of gsplat's `rasterization`. upstream: [C, H, W, D].
     """
     from gsplat import rasterize_to_pixels
 
-    require_keys(info, _INTERSECTION, "info", "pass what gsplat.rasterization returned")
-    means2d, cameras = info["means2d"], info["isect_offsets"].shape[0]
+    tiles = ("width", "height", "tile_size", "isect_offsets", "flatten_ids")
+    require_keys(info, ("gaussian_ids", "conics", "opacities", *tiles), "info", RENDERED)
+    means2d, images = info["means2d"], (info["isect_offsets"].shape[0], info["height"], info["width"])
     if means2d.grad is None and not means2d.requires_grad:
         raise InputError(WITHOUT_GRADIENT)
-    images = (cameras, info["height"], info["width"])
     if upstream.shape[:-1] != images:
         raise InputError(
             f"info['{PREDICTION}'] and info['{GROUND_TRUTH}'] are of shape {(*upstream.shape[:-1], 3)}: "
             f"expected {(*images, 3)}, what gsplat.rasterization rendered"
         )
-    means2d = means2d.detach()
+    means2d, conics, opacities = (value.detach() for value in (means2d, info["conics"], info["opacities"]))
     with torch.enable_grad():
         channels = means2d.new_zeros(*means2d.shape[:-1], upstream.shape[-1]).requires_grad_()
-        conics, opacities = info["conics"].detach(), info["opacities"].detach()
-        tiles = (info[key] for key in ("width", "height", "tile_size", "isect_offsets", "flatten_ids"))
-        packed = info["gaussian_ids"] is not None
-        image, _ = rasterize_to_pixels(means2d, conics, channels, opacities, *tiles, packed=packed)
+        places, packed = (info[key] for key in tiles), info["gaussian_ids"] is not None
+        image, _ = rasterize_to_pixels(means2d, conics, channels, opacities, *places, packed=packed)
     return torch.autograd.grad(image, channels, upstream.to(image.dtype))[0]

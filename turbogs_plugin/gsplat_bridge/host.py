@@ -18,28 +18,18 @@ Optimizers = Mapping[str, torch.optim.Optimizer]
 PREDICTION, GROUND_TRUTH = "prediction", "ground_truth"
 """Keys of `info` under which a host puts its render and the ground truth."""
 
-STATISTICS = "gaussian_stats"
-"""Key under which `sparse_rasterization` leaves the pass's `GaussianStats` once backward has run."""
-
-LOSS_SHARES = "loss_shares"
-"""Key under which `sparse_rasterization` leaves [N] the Gaussians' shares of the loss once backward has run."""
-
-LAYOUTS: dict[str, list[tuple[str | int, ...]]] = {
-    "means": [("N", 3)],
-    "quats": [("N", 4)],
-    "scales": [("N", 3)],
-    "opacities": [("N",), ("N", 1)],
-    "sh0": [("N", 1, 3), ("N", 3)],
-    "shN": [("N", "B", 3)],
-}
-"""Shapes of each parameter, N Gaussians with B harmonics above band 0: gsplat's, then nerfstudio's splatfacto's, which
-is taken too."""
-
-ROLES = {"features_dc": "sh0", "features_rest": "shN", "colors": "sh0"}
-"""Names that hosts have for gsplat's: splatfacto's, and colours where there are no harmonics."""
+STATISTICS, LOSS_SHARES = "gaussian_stats", "loss_shares"
+"""Keys under which `sparse_rasterization` leaves the pass's `GaussianStats`, and [N] the Gaussians' shares of the loss,
+once backward has run."""
 
 GEOMETRY = ("means", "quats", "scales", "opacities")
 
+ROWS: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
+"""Shape of a Gaussian's row of each parameter but shN, as gsplat has it. A dimension of 1 may be there or not, as in
+nerfstudio's splatfacto."""
+
+ROLES = {"features_dc": "sh0", "features_rest": "shN", "colors": "sh0"}
+"""Names that hosts have for gsplat's: splatfacto's, and colours where there are no harmonics."""
 
 IN_IMAGES: dict[str, Any] = {
     **dict.fromkeys(("use_bilateral_grid", "use_fused_bilagrid", "depth_loss", "with_ut"), False),
@@ -50,12 +40,8 @@ IN_IMAGES: dict[str, Any] = {
 
 
 def require_options(options: Any, nothing: Mapping[str, Any], swap: str) -> None:
-    """Raise `InputError` where the options of a host ask for something that has no effect with a swap.
-
-    Args:
-        options: with attributes, as gsplat's `Config`; None: there are none.
-        nothing: name of an option -> the value that asks for nothing.
-    """
+    """Raise `InputError` where the options of a host (as gsplat's `Config`, or None) ask for what has no effect with a
+    swap. nothing: name of an option -> the value that asks for nothing."""
     for name, value in nothing.items():
         if (found := getattr(options, name, value)) != value:
             raise InputError(f"{name}={found!r} does not work with {swap}: leave it out")
@@ -69,10 +55,8 @@ def require_one_process(swap: str) -> None:
     """
     distributed = torch.distributed
     if distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1:
-        raise InputError(
-            f"{swap} works in one process, this process group has {distributed.get_world_size()}: train on one GPU, or "
-            "keep gsplat's own part there"
-        )
+        count = distributed.get_world_size()
+        raise InputError(f"{swap} works in one process, this process group has {count}: train on one GPU")
 
 
 def require_keys(mapping: Mapping[str, Any] | Parameters | None, keys: Iterable[str], what: str, remedy: str) -> None:
@@ -95,25 +79,20 @@ def host_gaussians(params: Mapping[str, Tensor] | Parameters, names: Iterable[st
 
     Args:
         params: name -> tensor.
-        names: those that are needed; where one of the others is missing, as in a host with its own colour model,
-            zeros stand in for it.
+        names: those that are needed; zeros stand in for another that is missing, as in a host with its own colours.
 
     Raises:
-        InputError: a parameter is missing, or has another shape than in gsplat's layout (opacities [N, 1] and sh0
-            [N, 3] are taken, too), or another number of rows.
+        InputError: a parameter is missing, or has another shape or another number of rows.
     """
     params = {role_of(name, params): value for name, value in params.items()}
     require_keys(params, names, "params", f"expected {', '.join(names)}")
-    count = params["means"].shape[0]
+    count = len(params["means"])
+    values = dict.fromkeys(PARAMETER_NAMES, params["means"].new_zeros(count, 1, 3))
     for name in [name for name in PARAMETER_NAMES if name in params]:
-        shape = tuple(params[name].shape)
-        sizes: dict[Any, int | None] = {"N": count, "B": shape[1] if len(shape) > 1 else None}
-        if shape not in [tuple(sizes.get(size, size) for size in layout) for layout in LAYOUTS[name]]:
-            expected = ", ".join(map(str, LAYOUTS[name][0]))
-            raise InputError(
-                f"parameter '{name}' has shape {shape}: expected [{expected}] with N = {count} as in 'means'"
-            )
-    absent = params["means"].new_zeros(count, 1, 3)
-    values = {name: params[name].detach() if name in params else absent for name in PARAMETER_NAMES}
-    values["opacities"], values["sh0"] = values["opacities"].view(count), values["sh0"].view(count, 1, 3)
+        value = params[name].detach()
+        row = ROWS.get(name, (*value.shape[1:2], 3))
+        if value.shape[:1] != (count,) or [size for size in value.shape[1:] if size != 1] != [s for s in row if s != 1]:
+            expected = f"[{', '.join(map(str, ('N', *row)))}] with N = {count} as in 'means'"
+            raise InputError(f"parameter '{name}' has shape {tuple(value.shape)}: expected {expected}")
+        values[name] = value.view(count, *row)
     return Gaussians(**values)

@@ -17,55 +17,61 @@ from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene import Photos, PosedImages
 from turbogs_plugin.types import Cameras
 
+AS_GSPLAT = "expected items as of gsplat's data sets"
 
-def read_items(trainset: Any, name: str, white: float, convert: Callable[[Tensor], Tensor]) -> list[dict[str, Any]]:
-    """The items of a data set, by number, read by several threads.
+
+def read_items(
+    trainset: Any, name: str, white: float, convert: Callable[[Tensor], Tensor]
+) -> tuple[list[dict[str, Any]], list[Tensor] | None]:
+    """The items of a data set, by number, read by several threads; and [H, W] bool of each, True where a pixel counts,
+    or None where no item has a mask.
 
     Args:
-        trainset: V items with "image" [H, W, 3], 0 .. `white`.
+        trainset: V items with "image" [H, W, 3], 0 .. `white`, and perhaps "mask" [H, W].
         name: of the data set, for messages.
         convert: of an image, 0 .. 255, what is kept of it in its item.
 
     Raises:
         InputError: it has no items by number, or cuts random patches (``patch_size``); or an image is no tensor
-            [H, W, 3], or not within 0 .. `white`.
+            [H, W, 3], or not within 0 .. `white`; or a mask has another size.
     """
     if not (hasattr(trainset, "__len__") and hasattr(trainset, "__getitem__")) or not len(trainset):
         raise InputError(f"{name} is a {type(trainset).__name__}: expected a data set with items by number, no loader")
     if getattr(trainset, "patch_size", None) is not None:
-        raise InputError(
-            f"{name} needs whole images, its patch_size is {trainset.patch_size}: leave patch_size out, as samples are "
-            "few pixels of a whole image already"
-        )
+        raise InputError(f"{name} needs whole images, its patch_size is {trainset.patch_size}: leave patch_size out")
 
     def read(number: int) -> dict[str, Any]:
         item, place = trainset[number], f"{name}[{number}]"
-        require_keys(
-            item if isinstance(item, dict) else {}, ("image",), place, "expected items as of gsplat's data sets"
-        )
-        image = item["image"]
+        require_keys(item if isinstance(item, dict) else {}, ("image",), place, AS_GSPLAT)
+        image, mask = item["image"], item.get("mask")
         if not isinstance(image, Tensor) or image.dim() != 3 or image.shape[-1] != 3:
             found = tuple(image.shape) if isinstance(image, Tensor) else type(image).__name__
             raise InputError(f"{place}['image'] is {found}: expected a tensor [H, W, 3], colours alone")
+        if mask is not None and tuple(mask.shape) != tuple(image.shape[:2]):
+            expected = f"{tuple(image.shape[:2])} as its image"
+            raise InputError(f"{place}['mask'] has shape {tuple(mask.shape)}: expected {expected}")
         low, high = (float(value) for value in image.aminmax())
         if not 0 <= low <= high <= white:
             raise InputError(f"{place}['image'] has values {low:g} .. {high:g}: expected 0 .. {white:g}; see white")
-        return {**item, "image": convert(image.float() * (255.0 / white)), "largest": high}
+        whole = torch.ones(image.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask).bool()
+        return {**item, "image": convert(image.float() * (255.0 / white)), "largest": high, "counts": whole}
 
     # Numbers, not iteration: a data set without __iter__ would be read past its end.
     with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
         items = list(pool.map(read, range(len(trainset))))
     if white > 1 and max(item["largest"] for item in items) <= 1:
         raise InputError(f"{name} has images within 0 .. 1, and white is {white:g}: pass white=1")
-    return items
+    masked = any(item.get("mask") is not None for item in items)
+    return items, [item["counts"] for item in items] if masked else None
 
 
 def posed_images(views: Any, white: float) -> PosedImages:
     """The views of a data set whose items have "image", "K" [3, 3], "camtoworld" [4, 4] and perhaps "mask" [H, W]."""
-    items, cameras = read_items(views, "views", white, lambda image: image.round().to(torch.uint8).cpu()), []
+    items, masks = read_items(views, "views", white, lambda image: image.round().to(torch.uint8).cpu())
+    cameras = []
     for number, item in enumerate(items):
         place = f"views[{number}]"
-        require_keys(item, ("K", "camtoworld"), place, "expected items as in gsplat's data sets")
+        require_keys(item, ("K", "camtoworld"), place, AS_GSPLAT)
         K, pose = (torch.as_tensor(item[key]).double().cpu() for key in ("K", "camtoworld"))
         for key, value, side in (("K", K, 3), ("camtoworld", pose, 4)):
             good = value.shape == (side, side) and bool(value.isfinite().all())
@@ -73,25 +79,11 @@ def posed_images(views: Any, white: float) -> PosedImages:
         turned = (pose[:3, :3] @ pose[:3, :3].T - torch.eye(3)).abs().max() < 1e-3
         require(bool(turned), f"{place}['camtoworld']", pose.tolist(), "a rotation and a place, without a scale")
         cameras.append((torch.linalg.inv(pose), K))
+    viewmats, Ks = (torch.stack(values).float() for values in zip(*cameras, strict=True))
     sizes = np.array([item["image"].shape[1::-1] for item in items], dtype=np.int64)
-    Ks = torch.stack([K for _, K in cameras]).float()
-    masks = masks_of(items, "views")
     return PosedImages(
-        Cameras(torch.stack([viewmat for viewmat, _ in cameras]).float(), Ks, sizes),
+        Cameras(viewmats, Ks, sizes),
         tuple(map(str, range(len(items)))),
         Photos(torch.cat([item["image"].reshape(-1, 3) for item in items]), sizes),
         None if masks is None else PixelMasks.from_images(masks),
     )
-
-
-def masks_of(items: list[dict[str, Any]], name: str) -> list[Tensor] | None:
-    """[H, W] bool of each item, True where a pixel counts; None where no item has a "mask"."""
-    for number, item in enumerate(items):
-        mask, shape = item.get("mask"), tuple(item["image"].shape[:2])
-        if mask is not None and tuple(mask.shape) != shape:
-            raise InputError(f"{name}[{number}]['mask'] has shape {tuple(mask.shape)}: expected {shape} as its image")
-    whole = (torch.ones(item["image"].shape[:2], dtype=torch.bool) for item in items)
-    masks = [item.get("mask") for item in items]
-    if all(mask is None for mask in masks):
-        return None
-    return [every if mask is None else torch.as_tensor(mask).bool() for every, mask in zip(whole, masks, strict=True)]

@@ -2,20 +2,17 @@
 
 A Gaussian's parameters are solved for together, but a gsplat trainer steps one optimizer after another and clears each
 gradient in between. Each member of the dict is therefore a `torch.optim.Optimizer` that *hands over* its gradient when
-it is stepped, and whichever member comes last, in any order, carries out the update of all. Until then no parameter
-moves.
+it is stepped, and whichever member comes last, in any order, carries out the update of all.
 
-A member's ``state`` holds what is kept for its parameter, as gsplat's operations on rows expect: the moments are
-tensors with one row a Gaussian; "step", which they leave as it is, is one number. The bias correction counts steps of
-the host, as torch's Adam does, not updates of each Gaussian: a new Gaussian, whose moments are zero, then moves faster
-than its rate (`GaussianMoments` says by how much), which hosts of few steps live on. Learning rate, betas and eps come
-from the member's own parameter group.
+A member's ``state`` holds its parameter's moments, with one row a Gaussian, as gsplat's operations on rows expect, and
+"step", which they leave as it is. The bias correction counts steps of the host, as torch's Adam does: a new Gaussian,
+whose moments are zero, then moves faster than its rate (see `GaussianMoments`), which hosts of few steps live on.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import torch
@@ -24,14 +21,13 @@ from torch import Tensor
 from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
-from turbogs_plugin.gsplat_bridge.host import GEOMETRY, ROLES, host_gaussians, require_one_process
+from turbogs_plugin.gsplat_bridge.host import GEOMETRY, ROLES, host_gaussians, require_keys, require_one_process
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, Step
 
 COUNT = "step"
-"""State of the means' member alone: [] float on the host, the updates so far. Named as in torch's Adam: gsplat's
-operations take every other value for one with rows."""
+"""State of the means' member alone: [] float on the host, the updates so far. Named as in torch's Adam."""
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
@@ -39,25 +35,13 @@ MOST_SKIPPED = 50
 """Iterations that may be skipped where fewer are made. A `GradScaler` halves its scale at each, so it needs a few dozen
 at most."""
 
-NEEDED = (*GEOMETRY, "sh0")
-"""Parameters without whose optimizer there is no update: a host may have no harmonics."""
-
 
 class SharedOptimizer:
     """Takes the place of an optimizer class: called once for each parameter, gives the members of one shared update.
 
-    Example::
-
-        optimizer_class = SharedOptimizer(MomentLMOptimizer())
-        optimizers = {
-            name: optimizer_class([{"params": splats[name], "lr": lr, "name": name}], eps=1e-15)
-            for name, lr in rates.items()
-        }
-
     Args:
-        optimizer: a `SparseAdam`, as a `MomentLMOptimizer` is, too. Its learning rates, betas and eps are replaced by
-            the values of the members' parameter groups. Autograd gives the sum of the gradients over views, so J has
-            one row, whatever `MomentLMOptimizer.rows` says.
+        optimizer: a `SparseAdam`, as a `MomentLMOptimizer` is, too. Its learning rates, betas and eps are those of the
+            members' parameter groups. Autograd gives the sum of the gradients over views, so J has one row.
     """
 
     def __init__(self, optimizer: SparseAdam) -> None:
@@ -66,13 +50,10 @@ class SharedOptimizer:
             raise InputError(f"SharedOptimizer takes SparseAdam() or MomentLMOptimizer(), an instance: got {name}")
         self.optimizer = copy.copy(optimizer)
         self.members: dict[str, MemberOptimizer] = {}
-        self.skipped: Tensor | None = None
         self._gradients: dict[str, Tensor | None] = {}
         self._infos: list[dict[str, Any]] = []  # shown since the first gradient of this round
         self._shown: list[dict[str, Any]] = []  # shown before it
-        self._told = False
-        self._told_skipped = False
-        self._made = self._dropped = 0
+        self._made = self._dropped = self._without_shares = 0
 
     def __call__(
         self,
@@ -82,13 +63,8 @@ class SharedOptimizer:
         eps: float | None = None,
         fused: bool | None = None,
     ) -> MemberOptimizer:
-        """The member of one parameter.
-
-        Args:
-            params: one group with "params", "name" (of the parameter) and "lr", as gsplat's trainers make them.
-            lr, betas, eps: values for a group that has none; the optimizer's where None.
-            fused: taken for the sake of hosts that pass it; the update is one for all parameters in any case.
-        """
+        """The member of one parameter, given by one group with "params", its "name" and "lr" as in gsplat's trainers;
+        the other values are for a group that has none, and `fused` has no effect."""
         require_one_process("SharedOptimizer")
         both = (self.optimizer.beta1, self.optimizer.beta2) if betas is None else tuple(betas)
         defaults = {"lr": lr, "betas": both, "eps": self.optimizer.eps if eps is None else eps}
@@ -108,107 +84,61 @@ class SharedOptimizer:
     def hand_over(self, name: str, gradient: Tensor | None) -> None:
         """Take a member's gradient; the last one to come carries out the update of all parameters.
 
-        Raises:
-            InputError: there is one of this member already.
+        A `GradScaler` leaves out each optimizer whose gradient has an inf: an iteration that lacks a member is skipped
+        whole, as soon as the next one begins. Raises `InputError` after `MOST_SKIPPED` of them, and more than were
+        made, and for a member that comes twice.
         """
+        waiting = ", ".join(each for each in PARAMETER_NAMES if each in self.members and each not in self._gradients)
+        again = name in self._gradients and gradient is not None
+        if again or any(self.members[each].parameter.grad is not None for each in self._gradients):
+            self._gradients, self._dropped = {}, self._dropped + 1
+            said = f"an iteration was skipped, as in it the optimizer of {waiting} was not stepped"
+            if self._dropped >= max(MOST_SKIPPED, self._made):
+                raise InputError(
+                    f"{said}, like {self._dropped} iterations, where {self._made} were made: step all in each, with no "
+                    "gradient accumulated in one; where a GradScaler leaves it out, see why it is never finite"
+                )
+            if self._dropped == 1:
+                print(f"SharedOptimizer: {said}. A GradScaler does that after an inf; else step all in each iteration.")
         if name in self._gradients:
-            raise InputError(
-                f"the optimizer of '{name}' was stepped twice: expected, as one update is shared by all, "
-                f"a step of {', '.join(self._waiting())} in between"
-            )
+            raise InputError(f"the optimizer of '{name}' was stepped twice: expected a step of {waiting} in between")
         if not self._gradients:
             self._shown, self._infos = self._infos, []
         self._gradients[name] = gradient
         if len(self._gradients) == len(self.members):
             self._update()
 
-    def drop_stale(self) -> None:
-        """Forget the gradients of an iteration in which not all members were stepped, as soon as the next one begins.
-
-        A `GradScaler` leaves out each optimizer whose gradient has an inf. The iteration is then skipped whole, for all
-        parameters, so no update mixes two iterations. The first such iteration is printed.
-
-        Raises:
-            InputError: `MOST_SKIPPED` iterations, and more than were made, lacked a member.
-        """
-        if all(self.members[name].parameter.grad is None for name in self._gradients):
-            return  # no backward ran since they were handed over
-        waiting = self._waiting()
-        self._gradients = {}
-        self._dropped += 1
-        if self._dropped >= max(MOST_SKIPPED, self._made):
-            raise InputError(
-                f"the optimizer of {', '.join(waiting)} was left out, and {self._dropped} iterations were skipped for "
-                f"that, {self._made} made: step all in each iteration, with no gradient accumulated in one of them; "
-                "where a GradScaler leaves one out, see why its gradient is never finite"
-            )
-        if not self._told_skipped:
-            print(
-                f"SharedOptimizer: an iteration was skipped, as in it the optimizer of {', '.join(waiting)} was not "
-                "stepped. A GradScaler does that after an inf; else step all in each iteration."
-            )
-        self._told_skipped = True
-
-    def _waiting(self) -> list[str]:
-        """The parameters whose gradient this round lacks."""
-        return [name for name in PARAMETER_NAMES if name in self.members and name not in self._gradients]
-
     def _update(self) -> None:
         require_one_process("SharedOptimizer")
         members, gradients = self.members, self._gradients
-        missing = [name for name in NEEDED if name not in members]
-        if missing:
-            raise InputError(
-                f"there is no optimizer of {', '.join(missing)}: make one of each parameter, as one update is shared"
-            )
+        require_keys(members, (*GEOMETRY, "sh0"), "optimizers", "make one of each parameter, as one update is shared")
         self._gradients = {}
         self._made += 1
         if all(gradient is None for gradient in gradients.values()):
             return
         gaussians = host_gaussians({name: member.parameter for name, member in members.items()}, members)
-        given: dict[str, Tensor] = {}
-        for name, value in gaussians.items():
-            gradient = gradients.get(name)
-            given[name] = torch.zeros_like(value) if gradient is None else gradient.reshape(value.shape)
         self._take_options()
-        moments = self._pack(gaussians)
-        self.optimizer.moments = moments
-        self.optimizer.step(gaussians, _one_row(given, self._shares(gaussians)), Step(0, 1, 1))
+        self.optimizer.moments = moments = GaussianMoments.zeros(gaussians)
+        moments.steps.fill_(int(members["means"].checked_state()[COUNT]))
+        for place, moment in self._moments(moments):
+            place.copy_(moment.reshape(place.shape))
+        self.optimizer.step(gaussians, _one_row(gaussians, gradients, self._shares(gaussians)), Step(0, 1, 1))
         self._shown = []
         for place, moment in self._moments(moments):
             moment.copy_(place.reshape(moment.shape))
         members["means"].checked_state()[COUNT] += 1
 
     def _take_options(self) -> None:
-        """Learning rates, betas and eps of the members' groups.
-
-        Raises:
-            InputError: betas or eps differ between members, or are none that Adam can use.
-        """
+        """Learning rates, betas and eps of the members' groups. Raises `InputError` for what Adam cannot use."""
         groups = {name: member.param_groups[0] for name, member in self.members.items()}
-        betas = {name: tuple(group["betas"]) for name, group in groups.items()}  # lists, where read from JSON or YAML
-        epsilons = {name: group["eps"] for name, group in groups.items()}
-        for option, values in (("betas", betas), ("eps", epsilons)):
-            if len(set(values.values())) > 1:
-                raise InputError(
-                    f"{option} differ between the members of one shared update: {values}; expected one value"
-                )
+        # Betas are lists, where read from JSON or YAML.
+        options = {name: (*group["betas"], group["eps"]) for name, group in groups.items()}
+        if len(set(options.values())) > 1:
+            raise InputError(f"betas and eps differ between the members of one shared update: {options}")
         rates: dict[str, Any] = {name: float(group["lr"]) for name, group in groups.items()}
-        (beta1, beta2), eps = betas["means"], epsilons["means"]
-        check_moments_config(beta1, beta2, eps)
+        check_moments_config(*options["means"])
         self.optimizer.learning_rates = LearningRates(**rates, means_final=rates["means"], batch_scale=1.0)
-        self.optimizer.beta1, self.optimizer.beta2, self.optimizer.eps = beta1, beta2, eps
-
-    def _pack(self, gaussians: Gaussians) -> GaussianMoments:
-        """The members' state in the form that the rule takes."""
-        packed = GaussianMoments.zeros(gaussians)
-        if self.skipped is None:
-            self.skipped = packed.skipped
-        packed.skipped = self.skipped
-        for place, moment in self._moments(packed):
-            place.copy_(moment.reshape(place.shape))
-        packed.steps.fill_(int(self.members["means"].checked_state()[COUNT]))
-        return packed
+        self.optimizer.beta1, self.optimizer.beta2, self.optimizer.eps = options["means"]
 
     def _moments(self, packed: GaussianMoments) -> Iterator[tuple[Tensor, Tensor]]:
         """Each moment of each parameter: its place in the packed form, and the member's own tensor."""
@@ -220,16 +150,16 @@ class SharedOptimizer:
         """[1, N] the Gaussians' share of the loss, a mean over the renders; zero where nothing is known of it."""
         known = [loss_shares(info, len(gaussians)) for info in self._shown]
         shares = [value for value in known if value is not None]
-        if not shares:
-            if not self._told and self.optimizer.lm is not None:
-                print(
-                    f"{type(self.optimizer).__name__}: the Gaussians' shares of the loss are not known, so steps are "
-                    "Adam's; put prediction and ground_truth into info before loss.backward(), and call "
-                    "optimizers['means'].observe(info) after it (TurboDensityStrategy does that)."
-                )
-            self._told = True
-            return gaussians.means.new_zeros(1, len(gaussians))
-        return torch.stack(shares).mean(dim=0, keepdim=True).to(gaussians.means.dtype)
+        if shares:
+            return torch.stack(shares).mean(dim=0, keepdim=True).to(gaussians.means.dtype)
+        self._without_shares += 1
+        if self._without_shares == 1 and self.optimizer.lm is not None:
+            print(
+                f"{type(self.optimizer).__name__}: the Gaussians' shares of the loss are not known, so steps are "
+                "Adam's; put prediction and ground_truth into info before loss.backward(), and call "
+                "optimizers['means'].observe(info) after it (TurboDensityStrategy does that)."
+            )
+        return gaussians.means.new_zeros(1, len(gaussians))
 
 
 class MemberOptimizer(torch.optim.Optimizer):
@@ -250,8 +180,7 @@ class MemberOptimizer(torch.optim.Optimizer):
         self.name: str = roles[0]
 
     def __getstate__(self) -> dict[str, Any]:
-        """State for copies and pickles, with the part that torch's lacks. Members are copied together, as each
-        knows the others."""
+        """State for copies and pickles, with the part that torch's lacks."""
         return {**super().__getstate__(), "shared": self.shared, "name": self.name}
 
     @property
@@ -265,37 +194,18 @@ class MemberOptimizer(torch.optim.Optimizer):
         self.shared.observe(info)
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]  # overloads
-        """Hand the gradient over (``.grad`` is None afterwards); the last member to be stepped updates all.
-
-        Where a backward ran before all members were stepped, as when a `GradScaler` left one out, what the others
-        handed over before it is dropped: see `SharedOptimizer.drop_stale`.
-
-        Raises:
-            InputError: stepped twice before all the others were, a sparse gradient, or a mask in the closure's place.
-        """
-        if isinstance(closure, Tensor):
-            raise InputError(
-                "step takes no visibility mask, rows without a gradient stay anyway: set visible_adam=False"
-            )
-        loss = None
-        if closure is None:
-            self.shared.drop_stale()
-        else:  # closures run a backward for each member, so a new gradient does not tell of a new iteration
-            with torch.enable_grad():
-                loss = closure()
+    def step(self, closure: Any = None) -> None:  # type: ignore[override]  # closures are refused
+        """Hand the gradient over (``.grad`` is None afterwards); the last member to be stepped updates all. Raises
+        `InputError` for a sparse gradient, a closure or a visibility mask, and as `SharedOptimizer.hand_over`."""
+        if closure is not None:
+            raise InputError("step takes no closure and no mask, rows without gradients stay: set visible_adam=False")
         gradient, self.parameter.grad = self.parameter.grad, None
         if gradient is not None and gradient.is_sparse:
             raise InputError(f"the gradient of '{self.name}' is sparse: expected a dense one (sparse_grad=False)")
         self.shared.hand_over(self.name, gradient)
-        return loss
 
     def checked_state(self) -> dict[str, Tensor]:
-        """The state of the parameter, zeros at first.
-
-        Raises:
-            InputError: the state has another number of rows than the parameter.
-        """
+        """The state of the parameter, zeros at first. Raises `InputError` where it is not of the parameter's shape."""
         parameter, state = self.parameter, self.state[self.parameter]
         if not state:
             state.update({moment: torch.zeros_like(parameter) for moment in MOMENTS})
@@ -303,20 +213,19 @@ class MemberOptimizer(torch.optim.Optimizer):
                 state[COUNT] = torch.zeros(())
         for moment in MOMENTS:
             if state[moment].shape != parameter.shape:
+                found, remedy = tuple(state[moment].shape), "rows were added or removed without the optimizer"
                 raise InputError(
-                    f"optimizer state '{moment}' of '{self.name}' has shape {tuple(state[moment].shape)}, "
-                    f"expected {tuple(parameter.shape)}: rows were added or removed without the optimizer"
+                    f"state '{moment}' of '{self.name}' has shape {found}, not {tuple(parameter.shape)}: {remedy}"
                 )
         return state
 
 
-def _one_row(gradients: dict[str, Tensor], shares: Tensor) -> GaussianGradients:
-    """Autograd's gradients as one row, the sum over views.
-
-    Args:
-        gradients: name -> [N, ...].
-        shares: [1, N].
-    """
-    touched = [(value.unsqueeze(-1).flatten(1) != 0).any(dim=1) for value in gradients.values()]
-    rows = {name: value if name == "shN" else value[None] for name, value in gradients.items()}
-    return GaussianGradients(**rows, touched=torch.stack(touched).any(dim=0), view_losses=shares)
+def _one_row(gaussians: Gaussians, gradients: dict[str, Tensor | None], shares: Tensor) -> GaussianGradients:
+    """Autograd's gradients, name -> [N, ...], as one row, the sum over views; a missing one is zero. shares: [1, N]."""
+    rows, touched = {}, torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)
+    for name, value in gaussians.items():
+        found = gradients.get(name)
+        gradient = torch.zeros_like(value) if found is None else found.reshape(value.shape)
+        touched |= (gradient.unsqueeze(-1).flatten(1) != 0).any(dim=1)
+        rows[name] = gradient if name == "shN" else gradient[None]
+    return GaussianGradients(**rows, touched=touched, view_losses=shares)

@@ -46,17 +46,11 @@ WITHOUT_EFFECT: dict[str, Any] = {**IN_IMAGES, **dict.fromkeys(_STEP.split(" "),
 
 @dataclass(frozen=True)
 class StepInfo:
-    """What a step gives. The host waits for a GPU where a number is read, and nowhere else.
+    """What a step gives. The host waits for a GPU where a number is read, and nowhere else."""
 
-    Args:
-        loss: [] float32 of the samples, before the step's update.
-        num_gaussians: after the step.
-        num_samples: pixels of the step, empty slots among them.
-    """
-
-    loss: Tensor
-    num_gaussians: int
-    num_samples: int
+    loss: Tensor  # [] float32 of the samples, before the step's update
+    num_gaussians: int  # after the step
+    num_samples: int  # pixels of the step, empty slots among them
     _colors: Tensor
     _truth: PhotoSamples
 
@@ -72,10 +66,10 @@ class TurboStep:
 
     The host's parameters are the model: after a step, ``splats`` holds its present values under the host's names. Their
     memory is shared, so what the host writes into them is trained on. Where a step changes the number of Gaussians,
-    ``splats`` gets new Parameters, as by gsplat's operations, and the `optimizers` are told.
+    ``splats`` gets new Parameters, as by gsplat's operations, and the `optimizers` are told, which are not stepped.
 
-    The first step appends a backdrop of `BACKDROP_COUNT` Gaussians where all cameras look one way, and errors of all
-    views are measured. The last of `max_steps` steps ends with the mean of the last tenth.
+    The first step appends a backdrop of `BACKDROP_COUNT` Gaussians where all cameras look one way. The last of
+    `max_steps` steps ends with the mean of the last tenth. All randomness follows from ``torch.initial_seed()``.
 
     Args:
         splats: gsplat's parameters, float32: means [N, 3], scales [N, 3] (log), quats [N, 4], opacities [N] (logit),
@@ -86,20 +80,15 @@ class TurboStep:
             differ. All are read once, by several threads.
         scene_scale: 1.1 times the largest distance of a camera from their mean; None: that is computed.
         max_steps: length of the training; None: as many as `proposed_steps` says.
-        optimizers: the host's, by the names of the parameters. They are not stepped here.
-        rates: names of the parameters whose learning rate is the host's: the present ``lr`` of their optimizer.
+        optimizers: the host's, by the names of the parameters.
+        rates: names of the parameters whose learning rate is the present ``lr`` of the host's optimizer.
         options: the host's, as gsplat's `Config`: those that would have no effect here are refused, and its
             `DefaultStrategy` is laid to rest (refine_stop_iter = 0).
         scene: of gsplat from 1.6 on, a container with more arrays over Gaussians, whose rows follow.
-        white: largest value of a photo.
         config: name of a packaged configuration, or a YAML file. overrides: ``section.key=value`` on top.
 
-    Attributes:
-        steps: how many are made. max_steps: of the training.
-
     Raises:
-        InputError: several processes, an option or a parameter without support, or views of another form. All
-            randomness follows from ``torch.initial_seed()``.
+        InputError: several processes, an option or a parameter without support, or views of another form.
     """
 
     def __init__(
@@ -119,7 +108,12 @@ class TurboStep:
     ) -> None:
         require_one_process("TurboStep")
         require_options(options, WITHOUT_EFFECT, "TurboStep, whose step is its own")
-        _lay_to_rest(getattr(options, "strategy", None))
+        strategy = getattr(options, "strategy", None)
+        if isinstance(strategy, DefaultStrategy):
+            strategy.refine_stop_iter = 0
+        elif strategy is not None:
+            name = type(strategy).__name__
+            raise InputError(f"strategy {name} would change the Gaussians beside TurboStep: use DefaultStrategy")
         self.splats, self.optimizers, self.scene = splats, {} if optimizers is None else optimizers, scene
         gaussians = self._checked()
         device, degree = gaussians.device, gaussians.sh_degree
@@ -149,14 +143,7 @@ class TurboStep:
         return int(wanted_iterations(facts, load_config(config, overrides))[0])
 
     def step(self, step: int) -> StepInfo:
-        """Make one step.
-
-        Args:
-            step: its number, from 0 on, or from `steps` on after `load_state_dict`.
-
-        Raises:
-            InputError: another number, or the host changed the number of Gaussians.
-        """
+        """Make the step of this number, `steps`. Raises `InputError` for another, or another number of Gaussians."""
         require_one_process("TurboStep")
         if step != self.steps or step >= self.max_steps:
             raise InputError(f"step is {step}: expected {self.steps}, the next one, below max_steps = {self.max_steps}")
@@ -181,24 +168,26 @@ class TurboStep:
             self._begin()
         self._catch_up()
         self.trainer.complete()
+        return self._state()
+
+    def _state(self) -> dict[str, Any]:
         numbers = {"steps": self.steps, "max_steps": self.max_steps, "seed": self.trainer.config.train.seed}
         return {**numbers, "trainer": self.trainer.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state. `splats` gets the state's values; parameters that are the host's alone must be loaded
-        before.
+        """Go on from a state. `splats` gets its values; parameters that are the host's alone must be loaded before.
 
         Raises:
             InputError: it is of another training, or not of this form.
         """
-        present = {"steps": 0, "max_steps": 0, "seed": 0, "trainer": self.trainer.state_dict()}
         try:
-            require_like(dict(state), present, "state")
+            require_like(dict(state), self._state(), "state")
             require(state["max_steps"] == self.max_steps, "state.max_steps", state["max_steps"], f"{self.max_steps}")
             count = len(state["trainer"]["gaussians"]["means"])
-            for name in [name for name in self.splats if role_of(name, self.splats) not in PARAMETER_NAMES]:
-                rows = len(self.splats[name])
-                require(rows == count, f"rows of splats['{name}']", rows, f"{count} as in the state: load them before")
+            for name, parameter in self.splats.items():
+                followed = role_of(name, self.splats) in PARAMETER_NAMES or len(parameter) == count
+                allowed = f"{count} as in the state: load them before"
+                require(followed, f"rows of splats['{name}']", len(parameter), allowed)
             self.trainer.load_state_dict(state["trainer"])
         except (KeyError, TypeError, IndexError, RuntimeError, ValueError) as error:
             raise InputError(f"the state does not fit this TurboStep: {error}") from None
@@ -210,7 +199,7 @@ class TurboStep:
         self._follow(RowUpdate(source, torch.zeros_like(source, dtype=torch.bool), {}))
 
     def _catch_up(self) -> None:
-        """Make the iterations again that had too little memory, until none is missing."""
+        """Make iterations that had too little memory again, until none is missing."""
         self.trainer.repeat_lost(wait=True)
         while self.trainer.iteration < self.steps:
             self.trainer.step()
@@ -222,8 +211,7 @@ class TurboStep:
         kept = BACKDROP_COUNT if trainer.config.train.backdrop else 0
         backdrop = trainer.gaussians.map(lambda value: value[len(trainer.gaussians) - kept :].clone())
         backdrop.means += trainer.center
-        pairs = {name: [value, getattr(backdrop, name)] for name, value in host.items()}
-        trainer.begin_with(Gaussians(**{name: torch.cat(pair) for name, pair in pairs.items()}))
+        trainer.begin_with(Gaussians(**{name: torch.cat([v, getattr(backdrop, name)]) for name, v in host.items()}))
         source = torch.arange(len(trainer.gaussians), device=trainer.device)
         fresh = source >= len(host)
         self._follow(RowUpdate(source.masked_fill(fresh, 0), fresh, {}))
@@ -242,10 +230,8 @@ class TurboStep:
             if ours is None or parameter.data_ptr() == ours.data_ptr():
                 continue
             if len(parameter) != len(ours):
-                raise InputError(
-                    f"splats['{name}'] has {len(parameter)} rows, and {len(ours)} after the last step: TurboStep adds "
-                    "and removes Gaussians itself; leave density control out, or begin a new TurboStep"
-                )
+                remedy = "TurboStep adds and removes Gaussians itself; leave density control out, or begin a new one"
+                raise InputError(f"splats['{name}'] has {len(parameter)} rows, not {len(ours)} as before: {remedy}")
             ours.copy_(parameter.detach().reshape(ours.shape))
             parameter.data = ours.view(parameter.shape)
 
@@ -256,14 +242,11 @@ class TurboStep:
             if parameter.dtype != torch.float32 and role_of(name, self.splats) in PARAMETER_NAMES:
                 raise InputError(f"splats['{name}'] is of {parameter.dtype}: expected torch.float32")
             if parameter.dim() == 0 or len(parameter) != len(gaussians):
-                raise InputError(
-                    f"splats['{name}'] has shape {tuple(parameter.shape)}: expected {len(gaussians)} rows, one a "
-                    "Gaussian, which can follow them; keep other parameters elsewhere"
-                )
+                expected = f"{len(gaussians)} rows, one a Gaussian; keep other parameters elsewhere"
+                raise InputError(f"splats['{name}'] has shape {tuple(parameter.shape)}: expected {expected}")
             if parameter.requires_grad and role_of(name, self.splats) not in {*self.optimizers, *PARAMETER_NAMES}:
-                raise InputError(
-                    f"splats['{name}'] is trained by an optimizer of the host: give optimizers, whose rows then follow"
-                )
+                remedy = "give optimizers, whose rows then follow"
+                raise InputError(f"splats['{name}'] is trained by an optimizer of the host: {remedy}")
         require(gaussians.shN.shape[1] in BANDS, "bands of shN", gaussians.shN.shape[1], f"among {BANDS}")
         require(len(gaussians) >= 2, "number of Gaussians", len(gaussians), "2 or more")
         return gaussians
@@ -271,11 +254,7 @@ class TurboStep:
 
 class HostTrainer(Trainer):
     """`Trainer` in a host's world, whose origin may be anywhere: density control and limits see the model with the
-    cameras' centre as origin, where they expect it.
-
-    Attributes:
-        seen: loss, colours and truth of the latest iteration.
-    """
+    cameras' centre as origin, where they expect it. `seen`: loss, colours and truth of the latest iteration."""
 
     _world: Gaussians
 
@@ -291,15 +270,12 @@ class HostTrainer(Trainer):
         return output
 
     def refine(self, step: Step) -> RowUpdate | None:
-        if not self.density.event_due(step):
-            return super().refine(step)
-        with self._centred():
+        with self._centred(self.density.event_due(step)):
             return super().refine(step)
 
     def follow(self, update: RowUpdate | None) -> None:
-        if update is not None or self.iteration % RESTRAIN_EVERY == 0:
-            with self._centred():
-                super().follow(update)
+        with self._centred(update is not None or self.iteration % RESTRAIN_EVERY == 0):
+            super().follow(update)
 
     def change_rows(self, update: RowUpdate) -> None:
         if "means" in update.values:
@@ -311,9 +287,10 @@ class HostTrainer(Trainer):
         self.gaussians = replace(self._world, means=self._world.means - self.center)
 
     @contextmanager
-    def _centred(self) -> Iterator[None]:
+    def _centred(self, wanted: bool) -> Iterator[None]:
         self._world = self.gaussians
-        self.gaussians = replace(self._world, means=self._world.means - self.center)
+        if wanted:
+            self.gaussians = replace(self._world, means=self._world.means - self.center)
         try:
             yield
         finally:
@@ -338,12 +315,3 @@ def scene_of(images: PosedImages, gaussians: Gaussians, scale: float | None) -> 
     require(0 < extent < float("inf"), "scene_scale", scale, "above 0 and finite")
     nothing = replace(images, cameras=images.cameras.select(()), names=(), masks=None)
     return Scene("host", images, nothing, points, torch.zeros(len(points), 3, dtype=torch.uint8), frame, extent)
-
-
-def _lay_to_rest(strategy: Any) -> None:
-    """Have a host's strategy change nothing. Raises `InputError` for one that would go on."""
-    if isinstance(strategy, DefaultStrategy):
-        strategy.refine_stop_iter = 0
-    elif strategy is not None:
-        name = type(strategy).__name__
-        raise InputError(f"strategy {name} would change the Gaussians beside TurboStep: use DefaultStrategy")
