@@ -44,6 +44,14 @@ struct SparseLossParams {
     const int32_t* overflow;  // [1] where not 0, the maps are left alone; or null
     float ema_old, ema_new;   // 1 - beta and beta, each rounded from double
     int16_t stamp;
+
+    // The depth term; all null without.
+    const float* depths;          // [P] rendered; 0: none
+    const float* inverse_depths;  // [Y] of cells of all views, row by row; 0: not known
+    const int64_t* first_cells;   // [V]
+    float* depth_gradients;       // [P] out
+    int cell;                     // side of a cell, pixels
+    float depth_factor;           // of the mean over the samples
 };
 
 // ---- Exposures, which turbogs_plugin/engine/exposures.py defines ----------------------------------
@@ -90,7 +98,8 @@ void launch_expose_colors(const ExposeColorsParams& params, cudaStream_t stream)
 void launch_exposure_backward(const ExposureBackwardParams& params, cudaStream_t stream);
 void launch_exposure_step(const ExposureStepParams& params, cudaStream_t stream);
 
-// For launch_sparse_loss: SSIM's part, where T is not 0, after the rest is enqueued.
+// For launch_sparse_loss: the parts of SSIM and of depth, where T is not 0, after the rest is enqueued.
 void launch_window_similarity(const SparseLossParams& params, cudaStream_t stream);
+void launch_depth_loss(const SparseLossParams& params, cudaStream_t stream);
 
 }  // namespace turbogs

@@ -281,6 +281,7 @@ void launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
     if (params.photos != nullptr && params.channels == 4) launch<true>(params, stream);
     else launch<false>(params, stream);
     if (params.structure == Structure::kSsim) launch_window_similarity(params, stream);
+    if (params.depths != nullptr) launch_depth_loss(params, stream);
 }
 
 }  // namespace turbogs

@@ -47,6 +47,7 @@ CASES = {
     ),
     "exposures": ("train.exposure=true", "train.background=random", "train.average_last=1.0"),
     "dropout": ("train.dropout=0.3",),
+    "depth": ("loss.depth_weight=0.5", "schedule.max_views=3"),
     "masked": ("schedule.min_views=7", "schedule.max_views=7"),
     "masked tiles": ("pixel_sampler.unit=tile", "schedule.type=fixed", "schedule.views=2"),
     "hosted": ("train.pixels_place=host",),

@@ -139,7 +139,9 @@ def test_the_loss_composites_transparent_photos(unit, loss):
     terms = loss.terms
     expected = training_kernels.sparse_loss(terms, rendered, truth, samples)
     update = MapUpdate(maps, step)
-    found = training_kernels.sparse_loss(terms, rendered, photos.colors.to(DEVICE), samples, update, None, COLOR)
+    found = training_kernels.sparse_loss(
+        terms, rendered, photos.colors.to(DEVICE), samples, update=update, background=COLOR
+    )
     largest = float(expected.color_gradients.abs().max())
     torch.testing.assert_close(found.color_gradients, expected.color_gradients, rtol=1e-5, atol=1e-4 * largest)
     torch.testing.assert_close(found.pixel_errors, expected.pixel_errors, rtol=1e-6, atol=5e-7)

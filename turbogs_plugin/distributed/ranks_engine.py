@@ -116,7 +116,12 @@ class RanksEngine:
         self._flags.append((self._passes, flags, event))
         self._passes += 1
         batch = Batch(rank, self.engine, self._exchange, gaussians, cameras, samples, options, shares)
-        return SharedRendered(colors, colors[:0, 0], None, batch, rendered)
+        depths = None
+        if options.with_depth:
+            depths = torch.zeros(len(samples), device=self.device)
+            if rendered is not None:
+                depths[own.slots] = rendered.depths
+        return SharedRendered(colors, colors[:0, 0], depths, batch, rendered)
 
     def settle(self, wait: bool = False) -> int:
         while self._flags and (wait or self._flags[0][0] <= self._passes - LAG):
@@ -198,7 +203,8 @@ class Batch:
 
 @dataclass
 class SharedRendered(Rendered):
-    """One forward pass of several processes: `colors` are of all samples, `alphas` [0] and `depths` are not shared."""
+    """One forward pass of several processes: `colors` are of all samples, `alphas` are not there, and `depths` are this
+    process's alone, 0 for others': a depth term's gradient goes back where the depth came from."""
 
     batch: Batch
     _rendered: Rendered | None  # this process's share; None: it has no samples
@@ -212,7 +218,10 @@ class SharedRendered(Rendered):
         if self._rendered is not None:
             slots = self.batch.shares[self.batch.rank].slots
             errors = None if upstream.pixel_errors is None else upstream.pixel_errors[slots]
-            own = self._rendered.backward(upstream.color_gradients[slots], errors, with_statistics=with_statistics)
+            depths = None if upstream.depth_gradients is None else upstream.depth_gradients[slots]
+            own = self._rendered.backward(
+                upstream.color_gradients[slots], errors, with_statistics=with_statistics, depth_gradients=depths
+            )
             plain = own.plain()
         return SharedScreen(self.batch, plain)
 

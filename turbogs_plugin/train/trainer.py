@@ -22,6 +22,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.limits import RESTRAIN_EVERY, Clearance, restrain_distant
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.depths import DepthSamples, InverseDepths
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.train.training_state import TrainingState
 from turbogs_plugin.types import GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
@@ -53,6 +54,9 @@ class Trainer(TrainingState):
         self.schedule = config.build("schedule")
         self.pixel_sampler = config.build("pixel_sampler")
         self.loss = config.build("loss")
+        self.depths: InverseDepths | None = None
+        if self.loss.terms is not None and self.loss.terms.depth_weight > 0:
+            self.depths = InverseDepths.of(scene.train, scene.points).to(device)
         self.clearance: Clearance | None = None
         if config.train.camera_clearance and not scene.drawn_points:
             self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)
@@ -87,15 +91,17 @@ class Trainer(TrainingState):
         cameras = self.views.cameras.select(view_ids)
         share = float(self.config.train.dropout) if self.iteration < DROPOUT_UNTIL * self.iterations else 0.0
         dropout = Dropout(share, step.seed, self.iteration)
-        options = RenderOptions(self.sh_degree, self.config.raster, background=background, dropout=dropout)
+        options = RenderOptions(self.sh_degree, self.config.raster, self.depths is not None, background, dropout)
         rendered = self.engine.render(self.gaussians, cameras, samples, options)
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
-        loss = self.supervise(rendered.colors, truth, step)
+        depths = None if self.depths is None else DepthSamples(rendered.depths, self.depths)
+        loss = self.supervise(rendered.colors, truth, step, depths)
 
         # 8) Backward to the screen, summing for each Gaussian what step 11 needs (errors, weights, squares)
         stats = self.density.stats
-        screen = rendered.backward(loss.color_gradients, loss.pixel_errors, with_statistics=stats is not None)
+        given = {"with_statistics": stats is not None, "depth_gradients": loss.depth_gradients}
+        screen = rendered.backward(loss.color_gradients, loss.pixel_errors, **given)
 
         # 9) and 10) Backward to the parameters, solve for their updates and apply them; adds to `stats`
         self.update(screen, stats, step)
@@ -108,7 +114,9 @@ class Trainer(TrainingState):
         if self.parameter_mean is not None and self.parameter_mean.due(self.iteration, self.iterations):
             self.parameter_mean.add(self.learnt())
 
-    def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
+    def supervise(
+        self, colors: Tensor, truth: PhotoSamples, step: Step, depths: DepthSamples | None = None
+    ) -> LossOutput:
         """Loss and error maps, and the exposures of the photos where they are learnt.
 
         Loss and maps are one step if the loss is a rule, else the loss's own code comes first.
@@ -116,7 +124,7 @@ class Trainer(TrainingState):
         samples, update = truth.samples, MapUpdate(self.maps, step, self.nonfinite_losses)
         shown, terms = self.shown(colors, samples), self.loss.terms
         if terms is not None:
-            loss = self.engine.supervise(terms, shown, truth, update)
+            loss = self.engine.supervise(terms, shown, truth, update, depths)
         else:
             loss = self.loss(shown, truth.colors(), samples)
             require_output(loss, shown, self.config.loss["type"])

@@ -209,8 +209,10 @@ class LossOutput:
         loss: scalar.
         color_gradients: [P, 3], d loss / d rendered colour.
         pixel_errors: [P] float32, L1 norm over RGB of the residual (0 .. 3); zero in empty slots.
+        depth_gradients: [P], d loss / d rendered depth; None: the loss has no such term.
     """
 
     loss: Tensor
     color_gradients: Tensor
     pixel_errors: Tensor
+    depth_gradients: Tensor | None = None

@@ -30,6 +30,7 @@ from turbogs_plugin.engine.render_pass import ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.engine.shared import ModelCopies
 from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.scene.depths import CELL, DepthSamples
 from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds
 from turbogs_plugin.types import BLACK, Color, Gaussians, GaussianStats, LossOutput, PixelSamples, Step, TileGrid
 
@@ -132,6 +133,7 @@ def sparse_loss(
     colors: Tensor,
     targets: Tensor,
     samples: PixelSamples,
+    depths: DepthSamples | None = None,
     update: MapUpdate | None = None,
     overflow: Tensor | None = None,
     background: Color = BLACK,
@@ -163,6 +165,7 @@ def sparse_loss(
         loss=torch.zeros((), dtype=torch.float64, device=colors.device) if workspace is None else workspace.zero(),
         color_gradients=buffers.floats("color_gradients", slots, 3),
         pixel_errors=buffers.floats("pixel_errors", slots),
+        depth_gradients=None if depths is None else buffers.floats("depth_gradients", slots),
     )
     loss = launches.SparseLoss(
         colors=colors,
@@ -181,6 +184,10 @@ def sparse_loss(
         nonfinite_losses=nonfinite_losses,
         overflow=overflow,
         background=launches.Background(*background),
+        depths=None if depths is None else plain_floats(depths.rendered),
+        known=launches.NO_DEPTHS if depths is None else depths.known,
+        cell=CELL,
+        depth_factor=0.0 if depths is None else terms.depth_weight / depths.known.share,
     )
     library.launch(loss)
     return output
