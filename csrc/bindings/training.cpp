@@ -27,10 +27,11 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     }
     params.num_tiles = to_int(tiles, "tiles");
     params.unit = static_cast<SampleUnit>(in.integer(Integers::unit));
-    STD_TORCH_CHECK(params.unit == SampleUnit::kTile || chosen == tiles,
-                    "turbogs: tile_ids must have an entry for each tile");
+    const bool of_tiles = params.unit == SampleUnit::kTile;
+    STD_TORCH_CHECK(of_tiles || chosen == tiles, "turbogs: tile_ids must have an entry for each tile");
+    STD_TORCH_CHECK(!of_tiles || !in.has(Tensors::weights), "turbogs: whole tiles have no importance weights");
     const bool at_origin = params.views[0].origin_x == 0 && params.views[0].origin_y == 0;
-    STD_TORCH_CHECK(at_origin || (params.unit == SampleUnit::kTile && !masked),
+    STD_TORCH_CHECK(at_origin || (of_tiles && !masked),
                     "turbogs: another origin of the grid is for whole tiles without masks");
     params.num_chosen = to_int(chosen, "tiles");
     for (int i = 0; i < params.num_views; ++i) {
@@ -54,11 +55,10 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     in.set(params.tile_ids, Tensors::tile_ids, {chosen});
     in.set(params.tile_offsets, Tensors::tile_offsets, {chosen + 1});
     in.set_optional(params.weights, Tensors::weights, {slots});
-    if (params.unit == SampleUnit::kTile) {
+    if (of_tiles) {
         in.set(params.tile_errors, Tensors::tile_errors, {tiles});
         in.set(params.tile_ages, Tensors::tile_ages, {tiles});
         in.set(params.tile_keys, Tensors::tile_keys, {tiles});
-        in.set(params.tile_missed, Tensors::tile_missed, {tiles});
     }
     launch_sample_pixels(params, in.stream());
 }

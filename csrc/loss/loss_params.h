@@ -92,14 +92,12 @@ struct ExposureStepParams {
     float rate, eps, pull;
 };
 
-// A launcher only enqueues work on `stream`; `call` in bindings/library.cpp looks for its errors.
 void launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream);
 void launch_expose_colors(const ExposeColorsParams& params, cudaStream_t stream);
 void launch_exposure_backward(const ExposureBackwardParams& params, cudaStream_t stream);
 void launch_exposure_step(const ExposureStepParams& params, cudaStream_t stream);
 
-// For launch_sparse_loss: the parts of SSIM and of depth, where T is not 0, after the rest is enqueued.
+// For launch_sparse_loss: SSIM's part, where T is not 0, after the rest is enqueued.
 void launch_window_similarity(const SparseLossParams& params, cudaStream_t stream);
-void launch_depth_loss(const SparseLossParams& params, cudaStream_t stream);
 
 }  // namespace turbogs

@@ -37,7 +37,8 @@ CASES = {
     "usual": ("train.average_last=1.0",),
     "one view": ("schedule.type=fixed", "schedule.views=1"),
     "one tile": ("schedule.type=fixed", "schedule.views=1", "schedule.pixel_budget=0.1", "pixel_sampler.unit=tile"),
-    "tiles": ("pixel_sampler.unit=tile", "pixel_sampler.importance=0.5"),
+    "tiles": ("pixel_sampler.unit=tile",),
+    "weights": ("pixel_sampler.importance=0.5",),
     "summed rows": ("optimizer.rows=summed",),
     "no rule": ("optimizer.type=adam",),
     # Its votes have a threshold, so the models must not part: a step where a gradient is only rounding has its sign.

@@ -75,6 +75,7 @@ def masked_maps(device, seed=0):
 )
 @pytest.mark.parametrize("views", [(0,), (1,), (3, NOTHING, 1, 0, 2)])
 def test_equal_sets(unit, rate, hard, stable, uniform, importance, views):
+    importance *= unit == "pixel"
     rule, step = DrawRule(unit, hard, stable, uniform, importance), Step(9, 20, 10, 2**40 + 5)
     found = training_kernels.sample_pixels(rule, masked_maps(DEVICE), views, rate, step)
     expected = draw_pixels(rule, masked_maps("cpu"), views, rate, step)

@@ -62,7 +62,9 @@ def relative(found, expected):
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize(("rate", "unit", "importance"), [(0.1, "pixel", 0.5), (0.3, "pixel", 0.0), (1.0, "tile", 1.0)])
+@pytest.mark.parametrize(
+    ("rate", "unit", "importance"), [(0.1, "pixel", 0.5), (0.3, "pixel", 0.0), (1.0, "pixel", 1.0), (0.5, "tile", 0.0)]
+)
 def test_equals_the_twin(name, rate, unit, importance):
     terms = CASES[name].terms
     samples = make_samples(rate, unit, importance)

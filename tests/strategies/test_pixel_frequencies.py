@@ -144,12 +144,11 @@ def test_weights_make_sums_unbiased(stages, columns, wanted, tolerance):
         assert error < SIGMAS * estimates.std() / rows**0.5 + tolerance * quantity.sum()
 
 
-@pytest.mark.parametrize("unit", UNITS)
 @pytest.mark.parametrize("importance", [0.25, 1.0])
-def test_weights_have_mean_one_and_same_draw(unit, importance):
+def test_weights_have_mean_one_and_same_draw(importance):
     maps, views = random_maps(), (4, 0, 3)
-    plain = ErrorGuidedPixelSampler(unit=unit).sample(maps, views, 0.2, step(95))
-    weighted = ErrorGuidedPixelSampler(unit=unit, importance=importance).sample(maps, views, 0.2, step(95))
+    plain = ErrorGuidedPixelSampler().sample(maps, views, 0.2, step(95))
+    weighted = ErrorGuidedPixelSampler(importance=importance).sample(maps, views, 0.2, step(95))
     assert torch.equal(plain.pixel_ids, weighted.pixel_ids)
     weights = weighted.weights
     assert weights.dtype == torch.float32

@@ -100,29 +100,18 @@ class Engine(Protocol):
             update.nonfinite_losses.add_(nonfinite)
 
     def evaluate_and_learn(
-        self,
-        terms: LossTerms,
-        colors: Tensor,
-        targets: Tensor,
-        samples: PixelSamples,
-        update: MapUpdate,
-        depths: DepthSamples | None = None,
+        self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
     ) -> LossOutput:
         """`evaluate`, then `learn`."""
-        output = self.evaluate(terms, colors, targets, samples, depths)
+        output = self.evaluate(terms, colors, targets, samples)
         self.learn(samples, colors, output, update)
         return output
 
-    def supervise(
-        self,
-        terms: LossTerms,
-        colors: Tensor,
-        truth: PhotoSamples,
-        update: MapUpdate,
-        depths: DepthSamples | None = None,
-    ) -> LossOutput:
-        """`evaluate` against the photos at the samples, then `learn`. `colors`: [P, 3], on the engine's device."""
-        return self.evaluate_and_learn(terms, colors, truth.colors(), truth.samples, update, depths)
+    def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
+        """`evaluate` against the truth at the samples, then `learn`. `colors`: [P, 3], on the engine's device."""
+        output = self.evaluate(terms, colors, truth.colors(), truth.samples, truth.depths)
+        self.learn(truth.samples, colors, output, update)
+        return output
 
     def expose(self, exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
         """[P, 3] float32: rendered colours [P, 3] as the exposure of each sample's photo shows them."""

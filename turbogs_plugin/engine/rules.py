@@ -31,7 +31,7 @@ class DrawRule:
         unit: one of `layout.SAMPLE_UNITS`.
         hard, stable: shares of the units drawn by error and by age; the mixed stage draws the rest.
         mixed_uniform: the mixed stage ignores error and age.
-        importance: a of the weights ``p^-a``; 0 for no weights.
+        importance: a of the weights ``p^-a`` of pixels; 0 for no weights.
         multiple: of unit ``pixel``: N_pix is the nearest multiple of this, which divides a tile's 256 pixels.
     """
 

@@ -285,8 +285,8 @@ class HostTrainer(Trainer):
         if self.clearance is not None:
             self.clearance = replace(self.clearance, centers=self.clearance.centers - self.center)
 
-    def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step, *depths: Any) -> LossOutput:
-        output = super().supervise(colors, truth, step, *depths)
+    def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
+        output = super().supervise(colors, truth, step)
         self.seen = output, colors, truth
         return output
 

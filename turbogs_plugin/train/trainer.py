@@ -95,8 +95,9 @@ class Trainer(TrainingState):
         rendered = self.engine.render(self.gaussians, cameras, samples, options)
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
-        depths = None if self.depths is None else DepthSamples(rendered.depths, self.depths)
-        loss = self.supervise(rendered.colors, truth, step, depths)
+        if self.depths is not None:
+            truth = replace(truth, depths=DepthSamples(rendered.depths, self.depths))
+        loss = self.supervise(rendered.colors, truth, step)
 
         # 8) Backward to the screen, summing for each Gaussian what step 11 needs (errors, weights, squares)
         stats = self.density.stats
@@ -114,9 +115,7 @@ class Trainer(TrainingState):
         if self.parameter_mean is not None and self.parameter_mean.due(self.iteration, self.iterations):
             self.parameter_mean.add(self.learnt())
 
-    def supervise(
-        self, colors: Tensor, truth: PhotoSamples, step: Step, depths: DepthSamples | None = None
-    ) -> LossOutput:
+    def supervise(self, colors: Tensor, truth: PhotoSamples, step: Step) -> LossOutput:
         """Loss and error maps, and the exposures of the photos where they are learnt.
 
         Loss and maps are one step if the loss is a rule, else the loss's own code comes first.
@@ -124,7 +123,7 @@ class Trainer(TrainingState):
         samples, update = truth.samples, MapUpdate(self.maps, step, self.nonfinite_losses)
         shown, terms = self.shown(colors, samples), self.loss.terms
         if terms is not None:
-            loss = self.engine.supervise(terms, shown, truth, update, depths)
+            loss = self.engine.supervise(terms, shown, truth, update)
         else:
             loss = self.loss(shown, truth.colors(), samples)
             require_output(loss, shown, self.config.loss["type"])

@@ -22,7 +22,6 @@ from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, RenderOptions, ScreenRecords
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.engine.shared import PassMemory, SharedEngine
-from turbogs_plugin.scene.depths import DepthSamples
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.types import Cameras, Gaussians, LossOutput, PixelSamples
 
@@ -77,33 +76,20 @@ class CudaEngine(SharedEngine):
         library.launch(launches.GatherColors(colors, list(counts), first, seen, self.overflow, list(parts)))
         return colors
 
-    def supervise(
-        self,
-        terms: LossTerms,
-        colors: Tensor,
-        truth: PhotoSamples,
-        update: MapUpdate,
-        depths: DepthSamples | None = None,
-    ) -> LossOutput:
+    def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
         # The kernel gathers the photos' colours itself if the photos and the maps of each view begin at the same pixel,
         # as a trainer places them; a caller may place them otherwise.
         photos, starts = truth.photos.colors, update.maps.offsets[list(truth.samples.view_ids)]
         aligned = len(photos) == len(update.maps.errors) and truth.starts.tolist() == starts.tolist()
         targets = photos if aligned else truth.colors()
         shared = self.overflow, truth.background, self.workspace
-        return training.sparse_loss(terms, colors, targets, truth.samples, depths, update, *shared)
+        return training.sparse_loss(terms, colors, targets, truth.samples, truth.depths, update, *shared)
 
     def evaluate_and_learn(
-        self,
-        terms: LossTerms,
-        colors: Tensor,
-        targets: Tensor,
-        samples: PixelSamples,
-        update: MapUpdate,
-        depths: DepthSamples | None = None,
+        self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
     ) -> LossOutput:
-        shared = update, self.overflow
-        return training.sparse_loss(terms, colors, targets, samples, depths, *shared, workspace=self.workspace)
+        shared = {"overflow": self.overflow, "workspace": self.workspace}
+        return training.sparse_loss(terms, colors, targets, samples, update=update, **shared)
 
     def learn_exposures(
         self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float

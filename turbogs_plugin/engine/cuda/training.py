@@ -52,7 +52,7 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     chosen, slots, draws = _places(rule, ends, tiles, live_starts)
     scratch = launches.NO_SCRATCH
     if by_tile:
-        dtypes = {"errors": torch.float64, "ages": torch.int32, "keys": torch.int64, "missed": torch.float32}
+        dtypes = {"errors": torch.float64, "ages": torch.int32, "keys": torch.int64}
         empty = partial(torch.empty, sum(tiles), device=device)
         scratch = SimpleNamespace(**{f"tile_{name}": empty(dtype=dtype) for name, dtype in dtypes.items()})
     parts = slots, chosen, chosen + 1

@@ -45,7 +45,7 @@ else:  # the fields that launches read of these
     Dropout = fields_of(int="threshold seed iteration")
     Upstream = fields_of(Tensor="color_gradients alpha_gradients depth_gradients pixel_errors")
     GaussianMoments = fields_of(Tensor="exp_avg exp_avg_sq exp_avg_shN exp_avg_sq_shN steps skipped")
-    TileScratch = fields_of(Tensor="tile_errors tile_ages tile_keys tile_missed")  # by tile of the batch
+    TileScratch = fields_of(Tensor="tile_errors tile_ages tile_keys")  # by tile of the batch
     Copies = fields_of(int="copy_0 copy_1 copy_2 copy_3 copy_4 copy_5 copy_6")
     ParameterRates = fields_of(float="means quats scales opacities sh0 shN")
     PixelMasks = fields_of(Tensor="tiles rows bits")  # [L] int32, [L] int32, [B, 8] int32
@@ -255,7 +255,7 @@ class SamplePixels(Launch):
     iteration: int
     now: int  # a stamp's age is `now` less the stamp
     samples: PixelSamples  # weights are None without importance
-    scratch: TileScratch  # float64, int32, int64 and float32; None for unit = pixel
+    scratch: TileScratch  # float64, int32 and int64; None for unit = pixel
 
 
 @dataclass
