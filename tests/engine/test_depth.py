@@ -17,7 +17,7 @@ from turbogs_plugin.engine.render_pass import RenderOptions
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Photos, PosedImages
-from turbogs_plugin.scene.depths import CELL, DepthSamples, InverseDepths
+from turbogs_plugin.scene.depths import CELL, DepthPair, InverseDepths
 from turbogs_plugin.scene.scene import Observations
 from turbogs_plugin.strategies.losses import EPSILON, CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.train.trainer import Trainer
@@ -46,7 +46,7 @@ def test_gradients_of_every_parameter_are_those_of_autograd():
     engine, options = ReferenceEngine(), RenderOptions(with_depth=True)
     rendered = engine.render(gaussians, CAMERAS, samples, options)
     blank = torch.zeros(len(samples), 3, dtype=torch.float64)
-    output = engine.evaluate(TERMS, blank, blank, samples, DepthSamples(rendered.depths, known))
+    output = engine.evaluate(TERMS, blank, blank, samples, DepthPair(rendered.depths, known))
 
     depths, x, y = rendered.depths.clone().requires_grad_(), *samples.coordinates().unbind(dim=1)
     second = samples.view_of_slot() == 1
@@ -69,7 +69,7 @@ def test_gradients_of_every_parameter_are_those_of_autograd():
         for step in (1e-5, -1e-5):
             moved = replace(gaussians, **{name: getattr(gaussians, name) + step * direction})
             again = engine.render(moved, CAMERAS, samples, options).depths
-            sides.append(depth_loss(TERMS, DepthSamples(again, known), samples)[0])
+            sides.append(depth_loss(TERMS, DepthPair(again, known), samples)[0])
         slope = (getattr(found, name).reshape(direction.shape) * direction).sum()
         torch.testing.assert_close(slope, (sides[0] - sides[1]) / 2e-5, rtol=2e-3, atol=1e-7)
 
@@ -80,7 +80,7 @@ def test_no_depth_makes_a_gradient_that_is_not_finite(truth, dtype):
     """Nothing is learnt where either depth is none: not positive, not finite, or nearer than any near plane."""
     samples, known = dense_samples(CAMERAS), cells_of(torch.tensor([truth]))
     depths = torch.tensor(DEPTHS, dtype=dtype).repeat(len(samples))[: len(samples)]
-    loss, gradients = depth_loss(TERMS, DepthSamples(depths, known), samples)
+    loss, gradients = depth_loss(TERMS, DepthPair(depths, known), samples)
     assert loss.isfinite() and gradients.isfinite().all()
     assert bool(gradients[depths == 2.0].any()) == (0 < truth <= 1e3)
     for depth in (0.0, 1e-30, -1.0):
@@ -90,7 +90,7 @@ def test_no_depth_makes_a_gradient_that_is_not_finite(truth, dtype):
 def test_one_known_cell_pulls_its_samples_alone():
     samples, known = dense_samples(CAMERAS), cells_of(torch.zeros(1))
     known.cells[0] = 0.25
-    _, gradients = depth_loss(TERMS, DepthSamples(torch.full((len(samples),), 2.0), known), samples)
+    _, gradients = depth_loss(TERMS, DepthPair(torch.full((len(samples),), 2.0), known), samples)
     inside = (samples.coordinates() < CELL).all(dim=1) & (samples.view_of_slot() == 0)
     assert torch.equal(gradients != 0, inside) and (gradients[inside] < 0).all(), "too near: the loss falls with depth"
 
@@ -149,5 +149,5 @@ def test_training_with_the_term_brings_depths_nearer(tmp_path):
         depths = trainer.engine.render(
             trainer.gaussians, trainer.views.cameras, samples, RenderOptions(with_depth=True)
         )
-        errors.append(float(depth_loss(TERMS, DepthSamples(depths.depths, known), samples)[0]))
+        errors.append(float(depth_loss(TERMS, DepthPair(depths.depths, known), samples)[0]))
     assert errors[1] < 0.9 * errors[0]

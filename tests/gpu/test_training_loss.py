@@ -13,7 +13,7 @@ from turbogs_plugin.engine.reference.draws import draw_pixels
 from turbogs_plugin.engine.reference.losses import sparse_loss
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.scene.depths import CELL, DepthSamples, InverseDepths
+from turbogs_plugin.scene.depths import CELL, DepthPair, InverseDepths
 from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.types import Step
 
@@ -126,9 +126,9 @@ def test_the_depth_term_equals_the_twin(name, rate, unit, importance):
     depths = torch.rand(len(samples), generator=generator) * 5 + 0.01
     depths[::13], depths[1::17], depths[2::19], depths[3::23] = 0.0, 1e-30, 1e30, torch.inf
     terms = replace(CASES[name].terms, depth_weight=0.7)
-    expected = sparse_loss(terms, colors.double(), targets.double(), samples, DepthSamples(depths.double(), known))
+    expected = sparse_loss(terms, colors.double(), targets.double(), samples, DepthPair(depths.double(), known))
     given = terms, colors.to(DEVICE), targets.to(DEVICE), samples_to(samples, DEVICE)
-    found = training_kernels.sparse_loss(*given, DepthSamples(depths.to(DEVICE), known.to(DEVICE)))
+    found = training_kernels.sparse_loss(*given, DepthPair(depths.to(DEVICE), known.to(DEVICE)))
     assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
     gradients = found.depth_gradients.cpu()
     assert gradients.isfinite().all() and torch.equal(gradients == 0, expected.depth_gradients.float() == 0)

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from helpers.sampling_cases import SIGMAS, UNITS, random_maps, step, successive
+from helpers.sampling_cases import SIGMAS, random_maps, step, successive
 
 from turbogs_plugin.engine.reference.draws import Units, draw_units
 from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, random_words

@@ -116,11 +116,9 @@ class RanksEngine:
         self._flags.append((self._passes, flags, event))
         self._passes += 1
         batch = Batch(rank, self.engine, self._exchange, gaussians, cameras, samples, options, shares)
-        depths = None
-        if options.with_depth:
-            depths = torch.zeros(len(samples), device=self.device)
-            if rendered is not None:
-                depths[own.slots] = rendered.depths
+        depths = torch.zeros(len(samples), device=self.device) if options.with_depth else None
+        if depths is not None and rendered is not None:
+            depths[own.slots] = rendered.depths
         return SharedRendered(colors, colors[:0, 0], depths, batch, rendered)
 
     def settle(self, wait: bool = False) -> int:
@@ -217,12 +215,8 @@ class SharedRendered(Rendered):
         plain = None
         if self._rendered is not None:
             slots = self.batch.shares[self.batch.rank].slots
-            errors = None if upstream.pixel_errors is None else upstream.pixel_errors[slots]
-            depths = None if upstream.depth_gradients is None else upstream.depth_gradients[slots]
-            own = self._rendered.backward(
-                upstream.color_gradients[slots], errors, with_statistics=with_statistics, depth_gradients=depths
-            )
-            plain = own.plain()
+            parts = {name: None if value is None else value[slots] for name, value in vars(upstream).items()}
+            plain = self._rendered.backward(**parts, with_statistics=with_statistics).plain()
         return SharedScreen(self.batch, plain)
 
 

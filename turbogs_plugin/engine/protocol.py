@@ -19,7 +19,7 @@ from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.scene.depths import DepthSamples
+from turbogs_plugin.scene.depths import DepthPair
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
@@ -77,12 +77,7 @@ class Engine(Protocol):
 
     @abstractmethod
     def evaluate(
-        self,
-        terms: LossTerms,
-        colors: Tensor,
-        targets: Tensor,
-        samples: PixelSamples,
-        depths: DepthSamples | None = None,
+        self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, depths: DepthPair | None = None
     ) -> LossOutput:
         """The loss of rendered samples and its gradient. `colors`, `targets`: [P, 3]; `depths`: for a depth term."""
 

@@ -75,7 +75,7 @@ class InverseDepths:
 
 
 @dataclass(frozen=True)
-class DepthSamples:
+class DepthPair:
     """d and d* of an iteration: depths rendered at its samples [P], 0 for none, and the depths that are known."""
 
     rendered: Tensor

@@ -14,7 +14,7 @@ from torch import Tensor
 from turbogs_plugin.types import BLACK, Color, PixelSamples
 
 if TYPE_CHECKING:
-    from turbogs_plugin.scene.depths import DepthSamples
+    from turbogs_plugin.scene.depths import DepthPair
 
 PHOTO_BYTES = 3
 """Bytes of a pixel of an opaque photo; a transparent one has one more."""
@@ -82,7 +82,7 @@ class PhotoSamples:
     photos: Photos
     samples: PixelSamples
     background: Color = BLACK
-    depths: DepthSamples | None = None
+    depths: DepthPair | None = None
 
     @property
     def starts(self) -> np.ndarray:

@@ -22,7 +22,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.limits import RESTRAIN_EVERY, Clearance, restrain_distant
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.depths import DepthSamples, InverseDepths
+from turbogs_plugin.scene.depths import DepthPair, InverseDepths
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.train.training_state import TrainingState
 from turbogs_plugin.types import GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
@@ -96,7 +96,7 @@ class Trainer(TrainingState):
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
         if self.depths is not None:
-            truth = replace(truth, depths=DepthSamples(rendered.depths, self.depths))
+            truth = replace(truth, depths=DepthPair(rendered.depths, self.depths))
         loss = self.supervise(rendered.colors, truth, step)
 
         # 8) Backward to the screen, summing for each Gaussian what step 11 needs (errors, weights, squares)

@@ -21,14 +21,8 @@ PATCH_WIDTH, PATCH_HEIGHT = 8, 4
 
 
 def sample_order(x: Tensor, y: Tensor) -> Tensor:
-    """Rank of a pixel within its tile: row-major over patches of 8x4, then row-major within the patch.
-
-    Args:
-        x, y: integer tensors of one shape, coordinates within the tile, 0 .. TILE_SIZE - 1.
-
-    Returns:
-        Integers 0 .. TILE_SIZE^2 - 1 of the same shape.
-    """
+    """Rank of a pixel within its tile, 0 .. TILE_SIZE^2 - 1: row-major over patches of 8x4, then within the patch. `x`,
+    `y`: integer tensors of one shape, coordinates within the tile."""
     patch = (y // PATCH_HEIGHT) * (TILE_SIZE // PATCH_WIDTH) + x // PATCH_WIDTH
     return patch * (PATCH_WIDTH * PATCH_HEIGHT) + (y % PATCH_HEIGHT) * PATCH_WIDTH + x % PATCH_WIDTH
 

@@ -2,9 +2,9 @@
 
 Each function does what its torch twin in `engine.reference` defines: `draws.draw_pixels`, `losses.sparse_loss` with
 `ErrorMaps.update`, `raster.ReferenceScreenGradients.parameter_gradients` with `update.apply_update`, and
-`engine.exposures`. It is enqueued on
-torch's current stream and does not wait. Tensors must be contiguous. A wrong device, dtype or shape, or a batch without
-a view or with more than `MAX_VIEWS`, raises `RuntimeError`, which names the tensor and what was expected.
+`engine.exposures`. It is enqueued on torch's current stream and does not wait. Tensors must be contiguous. A wrong
+device, dtype or shape, or a batch without a view or with more than `MAX_VIEWS`, raises `RuntimeError`, which names the
+tensor and what was expected.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from turbogs_plugin.engine.render_pass import ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.engine.shared import ModelCopies
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.scene.depths import CELL, DepthSamples
+from turbogs_plugin.scene.depths import CELL, DepthPair
 from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds
 from turbogs_plugin.types import BLACK, Color, Gaussians, GaussianStats, LossOutput, PixelSamples, Step, TileGrid
 
@@ -133,7 +133,7 @@ def sparse_loss(
     colors: Tensor,
     targets: Tensor,
     samples: PixelSamples,
-    depths: DepthSamples | None = None,
+    depths: DepthPair | None = None,
     update: MapUpdate | None = None,
     overflow: Tensor | None = None,
     background: Color = BLACK,

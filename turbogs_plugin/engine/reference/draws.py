@@ -24,13 +24,13 @@ The draw is defined down to the bit, so that `draw_pixels` here and its CUDA twi
      each rounded to float32. S and B are the exact sums of E and A over all units of the tile (of the view for unit =
      tile), drawn or not, rounded to float32. A quotient by zero counts as 0. For `mixed` = uniform, M = 1.
 
-Importance weights, of pixels alone, are ``w = p^-a`` over their mean. p is the probability that a unit is drawn, given the keys of the
-others ("rank conditioning", Cohen and Kaplan 2007: dividing by it makes a single stage exactly unbiased). In a stage,
-tau is the least key with which the unit would have been taken. For a unit that the stage takes, it is the largest key
-left (none if the stage takes all). For any other unit, drawn before or not at all, it is the smallest key taken. If
-tau stands below for the number in its high bits, the probability of a stage is ``1 - exp(-max(E or M, 2^-100) / tau)``
-in a race, ``clamp(((A + 1) << 24) - tau, 0, 2^24) / 2^24`` in the stable stage, and 1 without a tau. It is 0 for a
-stage that takes nothing. Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all units of a
+Importance weights, of pixels alone, are ``w = p^-a`` over their mean. p is the probability that a pixel is drawn, given
+the keys of the others ("rank conditioning", Cohen and Kaplan 2007: dividing by it makes a single stage exactly
+unbiased). In a stage, tau is the least key with which the pixel would have been taken. Of one that the stage takes, it
+is the largest key left (none if the stage takes all); of any other, drawn before or not at all, the smallest key taken.
+With tau for the number in its high bits, the probability of a stage is ``1 - exp(-max(E or M, 2^-100) / tau)`` in a
+race, ``clamp(((A + 1) << 24) - tau, 0, 2^24) / 2^24`` in the stable stage, and 1 without a tau. It is 0 for a stage
+that takes nothing. Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all units of a
 row are drawn.
 
 Where maps have masks, a masked pixel is no unit, adds to no sum, and is in no tile that is drawn. A tile without
@@ -183,16 +183,8 @@ def _draw_tiles(
     rate: float,
     rule: DrawRule,
 ) -> tuple[Tensor, list[int]]:
-    """Whole tiles as units, drawn from each view.
-
-    Args:
-        errors, ages: [T] of the tiles.
-        counts: [K] tiles of each view.
-        words: gives the random words of places [T, 1].
-
-    Returns:
-        Positions of the chosen tiles among the T; the number chosen of each view.
-    """
+    """Positions of whole tiles, drawn from each view, among the T; the number drawn of each view. `errors`, `ages`:
+    [T] of the tiles; `counts`: [K] tiles of each view; `words` gives the random words of places [T, 1]."""
     device, ends = errors.device, np.concatenate([[0], np.cumsum(counts)])
     tiles = torch.arange(len(errors), device=device)
     firsts = torch.as_tensor(np.repeat(ends[:-1], np.diff(ends)), device=device)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine.layout import WINDOW_RADIUS
 from turbogs_plugin.engine.rules import LUMINANCE_CONSTANT, STRUCTURE_CONSTANT, WINDOW_SIGMA, LossTerms
-from turbogs_plugin.scene.depths import DepthSamples
+from turbogs_plugin.scene.depths import DepthPair
 from turbogs_plugin.types import TILE_SIZE, LossOutput, PixelSamples
 
 BALANCE_EPSILON = 1e-8
@@ -30,7 +30,7 @@ INVERSE_DEPTH_MAX = 1000.0
 
 
 def sparse_loss(
-    terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, depths: DepthSamples | None = None
+    terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, depths: DepthPair | None = None
 ) -> LossOutput:
     """The loss of some samples and its gradient, to which `depth_loss` adds with `depths`::
 
@@ -68,7 +68,7 @@ def sparse_loss(
     return LossOutput(loss, gradients, problem.pixel_errors, depth_gradients)
 
 
-def depth_loss(terms: LossTerms, depths: DepthSamples, samples: PixelSamples) -> tuple[Tensor, Tensor]:
+def depth_loss(terms: LossTerms, depths: DepthPair, samples: PixelSamples) -> tuple[Tensor, Tensor]:
     """The depth term of Algorithm 1, and its gradient by each rendered depth [P]::
 
         depth_weight / share * mean over filled samples of w * (sqrt(r^2 + eps^2) - eps),  r = 1 / d - 1 / d*
