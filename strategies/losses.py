@@ -7,7 +7,7 @@ has no loss. Formulas: `turbogs_plugin.engine.reference.losses`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from torch import Tensor
@@ -25,9 +25,23 @@ EPSILON = 1e-3
 
 @dataclass
 class RuleLoss(SparseLoss):
-    """A loss described by its terms. When called, the engine of the colours' device evaluates it."""
+    """A loss described by its terms. When called, the engine of the colours' device evaluates it.
 
-    terms: LossTerms = field(init=False, repr=False, compare=False, default_factory=lambda: LossTerms(EPSILON))
+    Args:
+        depth_weight: factor of the depth term (Algorithm 1's d and d*), which is added: the mean of ``|1/d - 1/d*|``
+            in 1 / extents, rounded below `EPSILON`, over the pixels whose depth d* the capture knows. 0: none.
+    """
+
+    depth_weight: float = 0.0
+    terms: LossTerms = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        self.terms = replace(self.rule(), depth_weight=self.depth_weight)
+        require_settings(self)
+
+    def rule(self) -> LossTerms:
+        """The terms beside the depth's."""
+        return LossTerms(EPSILON)
 
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
         return engine_of(colors.device).evaluate(self.terms, colors, targets, samples)
@@ -70,15 +84,9 @@ class CharbonnierNccLoss(RuleLoss):
     structure: Literal["ncc", "printed_ncc"] = "ncc"
     variance_constant: float = STRUCTURE_CONSTANT
 
-    def __post_init__(self) -> None:
+    def rule(self) -> LossTerms:
         require_positive(self, "variance_constant")
-        require_settings(self)
-        self.terms = LossTerms(
-            EPSILON,
-            structure=self.structure,
-            structure_weight=self.ncc_weight,
-            variance_constant=self.variance_constant,
-        )
+        return LossTerms(EPSILON, 1.0, self.structure, self.ncc_weight, self.variance_constant)
 
 
 @dataclass
@@ -94,7 +102,6 @@ class SparseSsimLoss(RuleLoss):
 
     ssim_weight: float = 0.2
 
-    def __post_init__(self) -> None:
+    def rule(self) -> LossTerms:
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
-        weight = self.ssim_weight
-        self.terms = LossTerms(EPSILON, l1_weight=1.0 - weight, structure="ssim", structure_weight=weight)
+        return LossTerms(EPSILON, 1.0 - self.ssim_weight, "ssim", self.ssim_weight)

@@ -86,8 +86,8 @@ class ErrorGuidedPixelSampler(RandomPixelSampler):
         stable_ratio: r_stable, share of the units of each tile drawn by age; 0.3 in the paper.
         mixed: draw of the remaining share, which the paper names but does not define: by `error_age`, the mean of the
             two normalised distributions, or `uniform`.
-        importance: exponent a of the importance weights p^-a, p the probability that a unit is drawn: 0 none, as in the
-            paper's runs; 1 unbiased (exactly so for a draw of a single stage).
+        importance: exponent a of the importance weights p^-a, p the probability that a pixel is drawn: 0 none, as in
+            the paper's runs; 1 unbiased (exactly so for a draw of a single stage). Whole tiles have none.
     """
 
     hard_ratio: float = 0.4
@@ -101,6 +101,7 @@ class ErrorGuidedPixelSampler(RandomPixelSampler):
         allowed = f"between 0 and 1 - hard_ratio ({1 - self.hard_ratio:g})"
         require(0 <= self.stable_ratio <= 1 - self.hard_ratio + 1e-9, "stable_ratio", self.stable_ratio, allowed)
         require(0 <= self.importance <= 1, "importance", self.importance, "between 0 and 1")
+        require(not self.importance or self.unit == "pixel", "importance", self.importance, "0 where unit is tile")
 
     @property
     def rule(self) -> DrawRule:

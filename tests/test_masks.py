@@ -82,7 +82,7 @@ class Foreign:
 
 SAMPLERS = [
     *(ErrorGuidedPixelSampler(unit=unit) for unit in UNITS),
-    *(ErrorGuidedPixelSampler(unit=unit, importance=1.0) for unit in UNITS),
+    ErrorGuidedPixelSampler(importance=1.0),
     *(RandomPixelSampler(unit=unit) for unit in UNITS),
     DensePixelSampler(),
     Foreign(),

@@ -27,10 +27,11 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     }
     params.num_tiles = to_int(tiles, "tiles");
     params.unit = static_cast<SampleUnit>(in.integer(Integers::unit));
-    STD_TORCH_CHECK(params.unit == SampleUnit::kTile || chosen == tiles,
-                    "turbogs: tile_ids must have an entry for each tile");
+    const bool of_tiles = params.unit == SampleUnit::kTile;
+    STD_TORCH_CHECK(of_tiles || chosen == tiles, "turbogs: tile_ids must have an entry for each tile");
+    STD_TORCH_CHECK(!of_tiles || !in.has(Tensors::weights), "turbogs: whole tiles have no importance weights");
     const bool at_origin = params.views[0].origin_x == 0 && params.views[0].origin_y == 0;
-    STD_TORCH_CHECK(at_origin || (params.unit == SampleUnit::kTile && !masked),
+    STD_TORCH_CHECK(at_origin || (of_tiles && !masked),
                     "turbogs: another origin of the grid is for whole tiles without masks");
     params.num_chosen = to_int(chosen, "tiles");
     for (int i = 0; i < params.num_views; ++i) {
@@ -54,14 +55,26 @@ void launches::SamplePixels::run(const Arguments<SamplePixels>& in) {
     in.set(params.tile_ids, Tensors::tile_ids, {chosen});
     in.set(params.tile_offsets, Tensors::tile_offsets, {chosen + 1});
     in.set_optional(params.weights, Tensors::weights, {slots});
-    if (params.unit == SampleUnit::kTile) {
+    if (of_tiles) {
         in.set(params.tile_errors, Tensors::tile_errors, {tiles});
         in.set(params.tile_ages, Tensors::tile_ages, {tiles});
         in.set(params.tile_keys, Tensors::tile_keys, {tiles});
-        in.set(params.tile_missed, Tensors::tile_missed, {tiles});
     }
     launch_sample_pixels(params, in.stream());
 }
+
+namespace {
+
+// Throws unless each view of the batch is one of `count` training views, of which there is `what`.
+template <class Params>
+void check_views(const Params& params, int64_t count, const char* what) {
+    for (int i = 0; i < params.num_views; ++i) {
+        const int number = params.views[i].view_number;
+        STD_TORCH_CHECK(number < count, "turbogs: view ", number, " lies outside the ", what);
+    }
+}
+
+}  // namespace
 
 void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
     const int64_t slots = in.tensor(Tensors::pixel_ids).numel(), tiles = in.tensor(Tensors::tile_ids).numel();
@@ -102,10 +115,7 @@ void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
         params.ema_old = static_cast<float>(1.0 - in.real(Reals::beta));
         params.ema_new = in.number(Reals::beta);
         params.stamp = static_cast<int16_t>(in.integer(Integers::stamp));
-        for (int i = 0; i < params.num_views; ++i) {
-            STD_TORCH_CHECK(params.views[i].view_number < num_views, "turbogs: view ", params.views[i].view_number,
-                            " lies outside the photos or maps");
-        }
+        check_views(params, num_views, "photos or maps");
     }
     in.set_optional(params.num_filled, Tensors::num_filled, {1});
     in.set(params.loss, Tensors::loss, {});
@@ -113,6 +123,16 @@ void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
     in.set(params.pixel_errors, Tensors::pixel_errors, {slots});
     in.set_optional(params.nonfinite_losses, Tensors::nonfinite_losses, {});
     in.set_optional(params.overflow, Tensors::overflow, {1});
+    params.cell = static_cast<int>(in.integer(Integers::cell));
+    params.depth_factor = in.number(Reals::depth_factor);
+    if (in.has(Tensors::depths)) {
+        const int64_t num_views = in.tensor(Tensors::starts).numel();
+        check_views(params, num_views, "known depths");
+        in.set(params.depths, Tensors::depths, {slots});
+        in.set(params.depth_gradients, Tensors::depth_gradients, {slots});
+        in.set(params.inverse_depths, Tensors::cells, {in.tensor(Tensors::cells).numel()});
+        in.set(params.first_cells, Tensors::starts, {num_views});
+    }
     launch_sparse_loss(params, in.stream());
 }
 
@@ -211,14 +231,6 @@ void launches::FusedStep::run(const Arguments<FusedStep>& in) {
     launch_fused_step(params, optimizer, in.stream());
 }
 
-template <class Params>
-void check_photos(const Params& params, int64_t photos) {
-    for (int i = 0; i < params.num_views; ++i) {
-        STD_TORCH_CHECK(params.views[i].view_number < photos, "turbogs: view ", params.views[i].view_number,
-                        " has no exposure");
-    }
-}
-
 // What both directions read. Returns P.
 template <class Launch>
 int64_t read_exposed(const Arguments<Launch>& in, ExposedSamples& params) {
@@ -226,7 +238,7 @@ int64_t read_exposed(const Arguments<Launch>& in, ExposedSamples& params) {
     const int64_t slots = in.tensor(Tensors::colors).numel() / 3, tiles = in.tensor(Tensors::tile_ids).numel();
     const int64_t photos = in.tensor(Tensors::offsets).numel() / kExposureNumbers;
     read_views(in, ViewRow::kSize, -1, params);
-    check_photos(params, photos);
+    check_views(params, photos, "exposures");
     params.num_tiles = to_int(tiles, "tiles");
     to_int(slots, "samples");
     in.set(params.tile_ids, Tensors::tile_ids, {tiles});
@@ -255,7 +267,7 @@ void launches::ExposureStep::run(const Arguments<ExposureStep>& in) {
     ExposureStepParams params = {};
     const int64_t photos = in.tensor(Tensors::steps).numel();
     read_views(in, ViewRow::kSize, -1, params);
-    check_photos(params, photos);
+    check_views(params, photos, "exposures");
     params.num_photos = to_int(photos, "photos");
     in.set(params.sums, Tensors::sums, {params.num_views, 3, 4});
     in.set(params.offsets, Tensors::offsets, {photos, 3, 4});

@@ -1,6 +1,7 @@
 // Sizes that all kernels and their bindings know, and a batch as kernels read it: its Gaussians and its views, which
 // bindings/arguments.h fills, and the view of a tile. What Python knows too comes from the header that the build makes
-// of turbogs_plugin/engine/layout.py. No torch here.
+// of turbogs_plugin/engine/layout.py. No torch here. A launcher (`launch_...`, of the headers `..._params.h`) only
+// enqueues work on its stream; `call` in bindings/library.cpp looks for its errors.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -69,13 +70,7 @@ __device__ __forceinline__ int partition_point(int low, int high, const Before& 
 // Tiles are numbered view after view: the view is the last one whose first tile, `tile_base`, is not beyond the tile.
 template <class View>
 __device__ __forceinline__ int view_of_tile(const View* __restrict__ views, int num_views, int tile) {
-    int low = 0, high = num_views;
-    while (high - low > 1) {
-        const int middle = (low + high) / 2;
-        if (views[middle].tile_base <= tile) low = middle;
-        else high = middle;
-    }
-    return low;
+    return partition_point(1, num_views, [&](int view) { return views[view].tile_base <= tile; }) - 1;
 }
 
 }  // namespace turbogs

@@ -22,6 +22,19 @@ __device__ __forceinline__ Number warp_sum(Number value) {
     return value;
 }
 
+// Sum over a block of kWarps warps, the same in each thread. Barriers inside, so `scratch` may be used again.
+template <int kWarps, class Number>
+__device__ __forceinline__ Number block_sum(Number value, Number (&scratch)[kWarps]) {
+    value = warp_sum(value);
+    __syncthreads();  // the last use of `scratch` is over
+    if (this_lane() == 0) scratch[this_warp()] = value;
+    __syncthreads();
+    Number total = 0;
+#pragma unroll
+    for (int warp = 0; warp < kWarps; ++warp) total += scratch[warp];
+    return total;
+}
+
 // Sums of 8 values over the warp, the same in every lane: the lanes first divide the values among themselves.
 __device__ __forceinline__ void warp_sums(float (&values)[8]) {
     const int lane = this_lane();

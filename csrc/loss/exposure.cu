@@ -26,10 +26,7 @@ __device__ __forceinline__ ColorMap load_map(const ExposedSamples& params, int v
     const float* offsets = params.offsets + kExposureNumbers * static_cast<size_t>(params.views[view].view_number);
     ColorMap map;
 #pragma unroll
-    for (int i = 0; i < 3; ++i) {
-#pragma unroll
-        for (int j = 0; j < 4; ++j) map.values[i][j] = offsets[4 * i + j];
-    }
+    for (int i = 0; i < kExposureNumbers; ++i) map.values[i / 4][i % 4] = offsets[i];
     return map;
 }
 

@@ -44,6 +44,14 @@ struct SparseLossParams {
     const int32_t* overflow;  // [1] where not 0, the maps are left alone; or null
     float ema_old, ema_new;   // 1 - beta and beta, each rounded from double
     int16_t stamp;
+
+    // The depth term; all null without.
+    const float* depths;          // [P] rendered; 0: none
+    const float* inverse_depths;  // [Y] of cells of all views, row by row; 0: not known
+    const int64_t* first_cells;   // [V]
+    float* depth_gradients;       // [P] out
+    int cell;                     // side of a cell, pixels
+    float depth_factor;           // of the mean over the samples
 };
 
 // ---- Exposures, which turbogs_plugin/engine/exposures.py defines ----------------------------------
@@ -84,7 +92,6 @@ struct ExposureStepParams {
     float rate, eps, pull;
 };
 
-// A launcher only enqueues work on `stream`; `call` in bindings/library.cpp looks for its errors.
 void launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream);
 void launch_expose_colors(const ExposeColorsParams& params, cudaStream_t stream);
 void launch_exposure_backward(const ExposureBackwardParams& params, cudaStream_t stream);

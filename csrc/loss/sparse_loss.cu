@@ -22,6 +22,11 @@ constexpr int kLossBlocks = 7;     // of an SM: 72 registers. With 64 it spills,
 constexpr int kLossWarps = kLossThreads / kWarpSize;
 constexpr float kBalanceEpsilon = 1e-8f;  // BALANCE_EPSILON of reference/losses.py
 constexpr float kErrorMax = 65504.0f;     // largest finite half
+constexpr float kInverseDepthMax = 1000.0f;  // INVERSE_DEPTH_MAX of reference/losses.py
+
+__device__ __forceinline__ float filled_slots(const SparseLossParams& params) {
+    return static_cast<float>(params.num_filled != nullptr ? max(*params.num_filled, 1) : params.num_slots);
+}
 
 // What a lane holds of a tile: of each kWarpSize slots one. An empty slot has weight 0 and pixel -1.
 template <int kSlots>
@@ -229,8 +234,7 @@ __global__ void __launch_bounds__(kLossThreads, kLossBlocks)
     __shared__ int views[kLossWarps];
     const int lane = this_lane(), warp = this_warp();
     const int tile = blockIdx.x * kLossWarps + warp;
-    const float filled =
-        static_cast<float>(params.num_filled != nullptr ? max(*params.num_filled, 1) : params.num_slots);
+    const float filled = filled_slots(params);
     const bool learns = params.errors != nullptr && (params.overflow == nullptr || *params.overflow == 0);
 
     TileTotals totals;
@@ -262,6 +266,36 @@ __global__ void __launch_bounds__(kLossThreads, kLossBlocks)
     }
 }
 
+// The depth term: `depth_loss` of reference/losses.py. A warp per tile.
+__global__ void __launch_bounds__(kLossThreads) depth_loss_kernel(const __grid_constant__ SparseLossParams params) {
+    __shared__ double losses[kLossWarps];
+    const int tile = blockIdx.x * kLossWarps + this_warp();
+    const float scale = params.depth_factor / filled_slots(params);
+    float sum = 0.0f;
+    if (tile < params.num_tiles) {
+        const SampleView& view = params.views[view_of_tile(params.views, params.num_views, params.tile_ids[tile])];
+        const float* known = params.inverse_depths + params.first_cells[view.view_number];
+        const int cells_x = (view.width + params.cell - 1) / params.cell, end = params.tile_offsets[tile + 1];
+        for (int slot = params.tile_offsets[tile] + this_lane(); slot < end; slot += kWarpSize) {
+            const int pixel = params.pixel_ids[slot], y = pixel / view.width, x = pixel - y * view.width;
+            const int cell = y / params.cell * cells_x + x / params.cell;
+            const float truth = pixel >= 0 ? known[cell] : 0.0f;
+            const float depth = params.depths[slot], inverse = 1.0f / depth;
+            float gradient = 0.0f;
+            if (depth > 0.0f && inverse <= kInverseDepthMax && truth > 0.0f && truth <= kInverseDepthMax) {
+                const float weight = params.weights != nullptr ? params.weights[slot] * scale : scale;
+                const float difference = inverse - truth;
+                const float root = sqrtf(difference * difference + params.epsilon * params.epsilon);
+                sum += weight * (difference * (difference / (root + params.epsilon)));
+                gradient = -weight * (difference / root) * inverse * inverse;
+            }
+            params.depth_gradients[slot] = gradient;
+        }
+    }
+    const double loss = block_sum(static_cast<double>(sum), losses);
+    if (threadIdx.x == 0) add_loss(params, loss);
+}
+
 template <bool kAlpha>
 void launch(const SparseLossParams& params, cudaStream_t stream) {
     // Slots of a lane, by the average tile: most samplers give every tile as many.
@@ -281,6 +315,8 @@ void launch_sparse_loss(const SparseLossParams& params, cudaStream_t stream) {
     if (params.photos != nullptr && params.channels == 4) launch<true>(params, stream);
     else launch<false>(params, stream);
     if (params.structure == Structure::kSsim) launch_window_similarity(params, stream);
+    if (params.depths == nullptr) return;
+    depth_loss_kernel<<<blocks_for(params.num_tiles, kLossWarps), kLossThreads, 0, stream>>>(params);
 }
 
 }  // namespace turbogs

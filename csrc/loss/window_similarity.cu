@@ -31,17 +31,6 @@ struct WindowMemory {
     float first[6];  // the first sample's x and y
 };
 
-// Sum over the block, the same in every thread. `partial` is free again after the next __syncthreads.
-__device__ __forceinline__ float block_sum(float value, float (&partial)[kWindowWarps]) {
-    value = warp_sum(value);
-    if (this_lane() == 0) partial[this_warp()] = value;
-    __syncthreads();
-    float total = 0.0f;
-#pragma unroll
-    for (int i = 0; i < kWindowWarps; ++i) total += partial[i];
-    return total;
-}
-
 // Sums over the window's rows of what the passes along the rows have left in `planes`.
 template <int kPlanes>
 __device__ __forceinline__ void sum_columns(const float (&planes)[kMoments][kTilePixels], float (&sums)[kPlanes]) {

@@ -62,7 +62,6 @@ struct OptimizerParams {
     unsigned long long* skipped;  // [] Gaussians left out because of a non-finite gradient
 };
 
-// A launcher only enqueues work on `stream`; `call` in bindings/library.cpp looks for its errors.
 void launch_projection_backward(const ScreenBackwardParams& params, const ProjectionBackwardOutputs& outputs,
                                 cudaStream_t stream);
 void launch_fused_step(const ScreenBackwardParams& params, const OptimizerParams& optimizer, cudaStream_t stream);

@@ -173,7 +173,6 @@ struct GatherParams {
     int32_t* overflow;               // [1] out, or null: kOverflow of any
 };
 
-// A launcher only enqueues work on `stream`; `call` in bindings/library.cpp looks for its errors.
 void launch_projection(const ProjectionParams& params, cudaStream_t stream);
 void launch_count_intersections(const CountIntersectionsParams& params, cudaStream_t stream);
 void launch_scatter_intersections(const SortIntersectionsParams& params, cudaStream_t stream);

@@ -23,10 +23,9 @@ struct SamplePixelsParams {
     SampleView views[kMaxViews];
     int stages[kMaxViews][3];  // units of the hard, stable and mixed stage: of a tile, or for unit tile of the view
     LiveTiles live[kMaxViews];
-    int slots_per_tile;        // unit pixel: slots of a tile that is not cut; also the cap of a cut one. With
-                               // masks, of every tile
+    int slots_per_tile;        // unit pixel: slots of a tile that is not cut, the most of a cut one; with masks of all
     bool mixed_uniform;
-    float importance;  // a of the weights p^-a, 0 for none
+    float importance;  // unit pixel: a of the weights p^-a, 0 for none
     PhiloxKeys keys;
     int now;  // a pixel's age is now - stamp, within 0 .. 32767
 
@@ -47,10 +46,8 @@ struct SamplePixelsParams {
     double* tile_errors;  // [tiles]
     int32_t* tile_ages;   // [tiles]
     int64_t* tile_keys;   // [tiles]
-    float* tile_missed;   // [tiles]
 };
 
-// A launcher only enqueues work on `stream`; `call` in bindings/library.cpp looks for its errors.
 void launch_sample_pixels(const SamplePixelsParams& params, cudaStream_t stream);
 void launch_sample_tiles(const SamplePixelsParams& params, cudaStream_t stream);  // unit tile
 

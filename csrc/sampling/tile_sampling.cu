@@ -38,18 +38,6 @@ __global__ void __launch_bounds__(kSampleThreads) tile_sums_kernel(const __grid_
     }
 }
 
-// Sum over the block, the same in every thread. `scratch` holds one entry a warp.
-template <class T>
-__device__ __forceinline__ T block_sum(T value, T* scratch) {
-    value = warp_sum(value);
-    __syncthreads();  // the last use of `scratch` is over
-    if (this_lane() == 0) scratch[this_warp()] = value;
-    __syncthreads();
-    T total = 0;
-    for (int warp = 0; warp < kChooseWarps; ++warp) total += scratch[warp];
-    return total;
-}
-
 // A block draws the tiles of one view. Keys hold the rank in their low bits, so no two are equal; -1 marks a tile
 // that is drawn already.
 __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
@@ -62,8 +50,6 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
     const double* errors = params.tile_errors + base;
     const int32_t* ages = params.tile_ages + base;
     int64_t* keys = params.tile_keys + base;
-    float* missed = params.tile_missed + base;
-    const bool weighted = params.weights != nullptr;
 
     double error_part = 0.0;
     long long age_part = 0;
@@ -71,61 +57,37 @@ __global__ void __launch_bounds__(kChooseThreads) choose_tiles_kernel(
         error_part += errors[i];
         age_part += ages[i];
         keys[i] = 0;
-        missed[i] = 1.0f;
     }
     const float error_sum = __double2float_rn(block_sum(error_part, double_scratch));
     const float age_sum = __ll2float_rn(block_sum(age_part, scratch));
 
-    // Tiles of the view for which a condition holds; the same in every thread.
-    const auto count_tiles = [&](const auto& holds) {
-        long long mine = 0;
-        for (int i = threadIdx.x; i < count; i += kChooseThreads) mine += holds(i);
-        return block_sum(mine, scratch);
-    };
     for (int stage = 0; stage < 3; ++stage) {
         const int wanted = params.stages[batch_view][stage];
         if (wanted == 0) continue;
-        const auto weight_of = [&](int i) {
-            const float error = __double2float_rn(errors[i]);
-            if (stage == 0) return error;
-            return params.mixed_uniform ? 1.0f : mixed_weight(error, ages[i], error_sum, age_sum);
-        };
         long long open = 0;
         for (int i = threadIdx.x; i < count; i += kChooseThreads) {
             if (keys[i] < 0) continue;
             ++open;
             const uint3 words = random_words(params.keys, static_cast<uint32_t>(i),
                                              static_cast<uint32_t>(view.view_number), kPurposeTiles);
+            const float error = __double2float_rn(errors[i]);
+            const float mixed = params.mixed_uniform ? 1.0f : mixed_weight(error, ages[i], error_sum, age_sum);
             const uint64_t primary = stage == 1 ? age_key(ages[i], words.y)
-                                                : race_key(weight_of(i), stage == 0 ? words.x : words.z);
+                                                : race_key(stage == 0 ? error : mixed, stage == 0 ? words.x : words.z);
             keys[i] = static_cast<int64_t>(primary << kRankBits | ((1u << kRankBits) - 1u - static_cast<uint32_t>(i)));
         }
-        const bool exhausted = block_sum(open, scratch) <= wanted;
         int64_t threshold = 0;
-        if (!exhausted) {
-            for (int bit = kTopBit; bit >= 0; --bit) {
-                const int64_t candidate = threshold | int64_t{1} << bit;
-                const long long total = count_tiles([&](int i) { return keys[i] >= candidate; });
-                if (total >= wanted) threshold = candidate;
-                if (total == wanted && !weighted) break;  // to the last bit, `threshold` is the smallest key taken
-            }
-        }
-        // The largest key left, found the same way: the largest number that some remaining key reaches.
-        int64_t largest_left = 0;
-        if (weighted && !exhausted) {
-            for (int bit = kTopBit; bit >= 0; --bit) {
-                const int64_t candidate = largest_left | int64_t{1} << bit;
-                const auto left = [&](int i) { return keys[i] < threshold && keys[i] >= candidate; };
-                if (count_tiles(left) > 0) largest_left = candidate;
-            }
+        long long total = block_sum(open, scratch);
+        for (int bit = kTopBit; bit >= 0 && total > wanted; --bit) {
+            const int64_t candidate = threshold | int64_t{1} << bit;
+            long long reached = 0;
+            for (int i = threadIdx.x; i < count; i += kChooseThreads) reached += keys[i] >= candidate;
+            reached = block_sum(reached, scratch);
+            if (reached < wanted) continue;
+            threshold = candidate;
+            total = reached;
         }
         for (int i = threadIdx.x; i < count; i += kChooseThreads) {
-            if (weighted) {
-                const int64_t tau = (keys[i] >= threshold ? largest_left : threshold) >> kRankBits;
-                const float chance = stage == 1 ? age_chance(ages[i], static_cast<uint64_t>(tau))
-                                                : race_chance(weight_of(i), static_cast<uint32_t>(tau));
-                missed[i] *= exhausted ? 0.0f : 1.0f - chance;
-            }
             if (keys[i] >= threshold) keys[i] = -1;
         }
     }
@@ -156,9 +118,7 @@ __global__ void __launch_bounds__(kSampleThreads) fill_tiles_kernel(const __grid
     if (chosen >= params.num_chosen) return;
     const int tile = params.tile_ids[chosen], first = chosen * kTilePixels, end = first + kTilePixels;
     const TilePixels pixels = locate_tile<kMasked>(params, tile);
-    const float weight =
-        params.weights != nullptr ? importance_weight(params.tile_missed[tile], params.importance) : 0.0f;
-    write_samples(params, pixels, pixels.inside, first, end, params.weights != nullptr, [&](int) { return weight; });
+    write_samples(params, pixels, pixels.inside, first, end, false, [](int) { return 0.0f; });
     __syncwarp();
     if (this_lane() == 0) {
         if (kMasked) params.tile_ids[chosen] = pixels.id_of_tile;  // in place of the place in the list

@@ -8,7 +8,7 @@ from helpers.rendering_scenes import dense_on_grid, make_cameras, make_gaussians
 
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference import compositing, projection
-from turbogs_plugin.engine.render import dense_samples, rasterize, render_image
+from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianStats, PixelSamples
@@ -17,13 +17,20 @@ SIZES = [(37, 29), (20, 50)]
 ACTIVATED = {"opaque": 5.0, "as made": 0.0}
 
 
-def upstream(samples: PixelSamples, seed: int = 0, dtype=torch.float64) -> tuple[torch.Tensor, ...]:
-    """Gradients of colours, alphas and depths, and errors; made-up values in empty slots too."""
-    generator = torch.Generator().manual_seed(seed)
-    count = len(samples)
+def upstream(samples: PixelSamples, dtype=torch.float64) -> dict[str, torch.Tensor]:
+    """Arguments of a backward pass; made-up values in empty slots too."""
+    generator, count = torch.Generator().manual_seed(0), len(samples)
     colors = torch.randn(count, 3, generator=generator, dtype=torch.float64)
     alphas, depths = torch.randn(2, count, generator=generator, dtype=torch.float64)
-    return tuple(value.to(dtype) for value in (colors, alphas, depths, colors.abs().sum(dim=1)))
+    values = {"color_gradients": colors, "pixel_errors": colors.abs().sum(dim=1)}
+    values |= {"alpha_gradients": alphas, "depth_gradients": depths}
+    return {name: value.to(dtype) for name, value in values.items()}
+
+
+def of_colors(samples: PixelSamples) -> tuple[torch.Tensor, torch.Tensor]:
+    """Gradients of colours, and errors."""
+    values = upstream(samples)
+    return values["color_gradients"], values["pixel_errors"]
 
 
 @pytest.mark.parametrize("opacity", ACTIVATED)
@@ -33,7 +40,7 @@ def test_sums_are_those_of_gsplats_torch_code(opacity, monkeypatch):
     gaussians, cameras = make_gaussians(40), make_cameras(SIZES)
     gaussians.opacities += ACTIVATED[opacity]
     samples = thin_out(dense_samples(cameras), 0.3, empty_slots=2)
-    color_gradients, _, _, errors = upstream(samples)
+    color_gradients, errors = of_colors(samples)
     errors = torch.where(samples.filled, errors, 0)
     drawn: list[Drawn] = []
     _, alphas, _ = gsplat_torch_render(gaussians, cameras, samples, drawn=drawn)
@@ -84,11 +91,8 @@ def test_what_lies_behind_the_end_of_a_pixel_has_no_gradient_at_all():
     gaussians, cameras = make_gaussians(200, dtype=torch.float32, spread=0.3), make_cameras([(32, 32)], torch.float32)
     gaussians.opacities[:] = 5.0
     samples = dense_samples(cameras)
-    colors, alphas, depths, errors = upstream(samples, dtype=torch.float32)
     rendered = rasterize(gaussians, cameras, samples, with_depth=True)
-    gradients = rendered.backward(colors, errors, alpha_gradients=alphas, depth_gradients=depths).parameter_gradients(
-        rows=True
-    )
+    gradients = rendered.backward(**upstream(samples, torch.float32)).parameter_gradients(rows=True)
     assert 10 < int(gradients.touched.sum()) < 190
     for name in PARAMETER_NAMES[:-1]:
         assert float(getattr(gradients, name)[:, ~gradients.touched].abs().max()) == 0
@@ -100,24 +104,18 @@ def test_values_and_gradients_are_those_of_gsplats_torch_code_and_rows_sum_to_th
     gaussians, cameras = make_gaussians(60), make_cameras(SIZES)
     gaussians.opacities += ACTIVATED[opacity]
     samples = thin_out(dense_samples(cameras), 0.4, empty_slots=3)
-    colors, alphas, depths, errors = upstream(samples)
+    values = upstream(samples)
     rendered = rasterize(gaussians, cameras, samples, with_depth=True)
-
-    def gradients(rows):
-        return rendered.backward(colors, errors, alpha_gradients=alphas, depth_gradients=depths).parameter_gradients(
-            rows
-        )
-
     leaves = gaussians.map(lambda value: value.clone().requires_grad_())
     outputs = gsplat_torch_render(leaves, cameras, samples)
     for ours, theirs in zip((rendered.colors, rendered.alphas, rendered.depths), outputs, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-13)
-    loss = (outputs[0] * colors).sum(dim=1) + outputs[1] * alphas + outputs[2] * depths
+    loss = (outputs[0] * values["color_gradients"]).sum(dim=1)
+    loss = loss + outputs[1] * values["alpha_gradients"] + outputs[2] * values["depth_gradients"]
     loss[samples.filled].sum().backward()
 
-    by_view = gradients(rows=True)
-    rendered = rasterize(gaussians, cameras, samples)
-    total = gradients(rows=False)
+    by_view = rendered.backward(**values).parameter_gradients(rows=True)
+    total = rasterize(gaussians, cameras, samples).backward(**values).parameter_gradients(rows=False)
     for name in PARAMETER_NAMES:
         expected = getattr(leaves, name).grad
         scale = float(expected.abs().max())
@@ -133,7 +131,7 @@ def test_values_and_gradients_are_those_of_gsplats_torch_code_and_rows_sum_to_th
 def test_each_view_row_is_the_gradient_of_that_view_alone():
     gaussians, cameras = make_gaussians(30), make_cameras(SIZES)
     samples = dense_samples(cameras)
-    colors, _, _, errors = upstream(samples)
+    colors, errors = of_colors(samples)
     rows = rasterize(gaussians, cameras, samples).backward(colors, errors).parameter_gradients(rows=True)
     for view in range(2):
         mine = samples.view_of_slot() == view
@@ -149,7 +147,7 @@ def test_absolute_gradients_and_squares_are_those_of_single_pixels():
     """One pixel at a time they are the gradient's absolute value, and the square of o * d loss / d o."""
     gaussians, cameras = make_gaussians(20), make_cameras([(6, 5)])
     samples = dense_samples(cameras)
-    colors, _, _, errors = upstream(samples)
+    colors, errors = of_colors(samples)
 
     def record(color_gradients):
         screen = rasterize(gaussians, cameras, samples).backward(color_gradients, errors, with_statistics=True)
@@ -169,7 +167,7 @@ def test_absolute_gradients_and_squares_are_those_of_single_pixels():
 def test_statistics_are_added_once_as_documented():
     gaussians, cameras = make_gaussians(30), make_cameras(SIZES)
     samples = thin_out(dense_samples(cameras), 0.5)
-    colors, _, _, errors = upstream(samples)
+    colors, errors = of_colors(samples)
     stats = GaussianStats.zeros(30, "cpu").map(lambda value: value + 1)
     screen = rasterize(gaussians, cameras, samples).backward(colors, errors, with_statistics=True)
     gradients = screen.parameter_gradients(rows=True, stats=stats)
@@ -194,28 +192,13 @@ def test_statistics_are_added_once_as_documented():
     torch.testing.assert_close(gradients.view_losses, record[..., ScreenRecord.ERROR_SUM] / len(samples))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_sparse_equals_dense_at_the_same_pixels(dtype):
-    gaussians, cameras = make_gaussians(80, dtype=dtype), make_cameras(SIZES, dtype)
-    samples = thin_out(dense_samples(cameras), 0.2, empty_slots=1)
-    rendered = rasterize(gaussians, cameras, samples, with_depth=True)
-    images = [render_image(gaussians, cameras, view, with_depth=True) for view in range(2)]
-    x, y = samples.coordinates().unbind(dim=-1)
-    views = samples.view_of_slot()
-    for slot in samples.filled.nonzero()[:, 0].tolist():
-        image = images[views[slot]]
-        for name in ("colors", "alphas", "depths"):
-            assert getattr(image, name).dtype == dtype
-            torch.testing.assert_close(getattr(rendered, name)[slot], getattr(image, name)[y[slot], x[slot]])
-
-
 @pytest.mark.parametrize("origin", [(1, 0), (15, 15), (6, 11)])
 def test_where_the_grid_of_tiles_begins_does_not_matter(origin):
     gaussians, cameras = make_gaussians(80), make_cameras(SIZES)
     by_grid = [dense_on_grid(cameras.sizes, place) for place in ((0, 0), origin)]
     assert len(by_grid[0]) == len(by_grid[1]) == cameras.sizes.prod(axis=1).sum()
     flat = [samples.flat_pixels(np.concatenate([[0], np.cumsum(samples.sizes.prod(axis=1))])) for samples in by_grid]
-    values, found = upstream(by_grid[0])[::3], []
+    values, found = of_colors(by_grid[0]), []
     for samples, pixels in zip(by_grid, flat, strict=True):
         colors, errors = (value[flat[0].argsort()][pixels] for value in values)
         rendered = rasterize(gaussians, cameras, samples, with_depth=True)
@@ -230,11 +213,10 @@ def test_block_and_slice_sizes_do_not_matter(monkeypatch):
     gaussians, cameras = make_gaussians(60), make_cameras(SIZES)
     gaussians.opacities += 3
     samples = thin_out(dense_samples(cameras), 0.4)
-    colors, alphas, depths, errors = upstream(samples)
 
     def everything():
         rendered = rasterize(gaussians, cameras, samples, with_depth=True)
-        record = rendered.backward(colors, errors, alpha_gradients=alphas, depth_gradients=depths).full_records()
+        record = rendered.backward(**upstream(samples)).full_records()
         return rendered.colors, rendered.alphas, rendered.depths, record
 
     expected = everything()

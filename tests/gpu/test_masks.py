@@ -75,6 +75,7 @@ def masked_maps(device, seed=0):
 )
 @pytest.mark.parametrize("views", [(0,), (1,), (3, NOTHING, 1, 0, 2)])
 def test_equal_sets(unit, rate, hard, stable, uniform, importance, views):
+    importance *= unit == "pixel"
     rule, step = DrawRule(unit, hard, stable, uniform, importance), Step(9, 20, 10, 2**40 + 5)
     found = training_kernels.sample_pixels(rule, masked_maps(DEVICE), views, rate, step)
     expected = draw_pixels(rule, masked_maps("cpu"), views, rate, step)
@@ -139,7 +140,9 @@ def test_the_loss_composites_transparent_photos(unit, loss):
     terms = loss.terms
     expected = training_kernels.sparse_loss(terms, rendered, truth, samples)
     update = MapUpdate(maps, step)
-    found = training_kernels.sparse_loss(terms, rendered, photos.colors.to(DEVICE), samples, update, None, COLOR)
+    found = training_kernels.sparse_loss(
+        terms, rendered, photos.colors.to(DEVICE), samples, update=update, background=COLOR
+    )
     largest = float(expected.color_gradients.abs().max())
     torch.testing.assert_close(found.color_gradients, expected.color_gradients, rtol=1e-5, atol=1e-4 * largest)
     torch.testing.assert_close(found.pixel_errors, expected.pixel_errors, rtol=1e-6, atol=5e-7)

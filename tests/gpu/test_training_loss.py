@@ -13,6 +13,7 @@ from turbogs_plugin.engine.reference.draws import draw_pixels
 from turbogs_plugin.engine.reference.losses import sparse_loss
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.scene.depths import CELL, DepthPair, InverseDepths
 from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.types import Step
 
@@ -61,7 +62,9 @@ def relative(found, expected):
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize(("rate", "unit", "importance"), [(0.1, "pixel", 0.5), (0.3, "pixel", 0.0), (1.0, "tile", 1.0)])
+@pytest.mark.parametrize(
+    ("rate", "unit", "importance"), [(0.1, "pixel", 0.5), (0.3, "pixel", 0.0), (1.0, "pixel", 1.0), (0.5, "tile", 0.0)]
+)
 def test_equals_the_twin(name, rate, unit, importance):
     terms = CASES[name].terms
     samples = make_samples(rate, unit, importance)
@@ -108,6 +111,30 @@ def test_windows_stay_bounded_where_their_variance_is_lost(level):
         assert 0 <= float(found.loss) <= 2
         assert (found.color_gradients.abs().amax(dim=1).cpu() <= bounds).all()
         assert torch.isfinite(found.color_gradients).all()
+
+
+@pytest.mark.parametrize("name", ["l1", "ssim"])
+@pytest.mark.parametrize(("rate", "unit", "importance"), [(0.1, "pixel", 0.5), (1.0, "tile", 0.0)])
+def test_the_depth_term_equals_the_twin(name, rate, unit, importance):
+    """Also where a depth is none, tiny or huge; the rest of the loss is to the bit as without the term."""
+    samples, generator = make_samples(rate, unit, importance), torch.Generator().manual_seed(4)
+    colors, targets, _ = make_colors(samples)
+    counts = (-(-SIZES // CELL)).prod(axis=1)
+    cells = (torch.rand(int(counts.sum()), generator=generator) - 0.3).clamp(min=0)
+    cells[::11], cells[1::29], cells[2::37] = torch.inf, 1e-30, torch.nan
+    known = InverseDepths(cells, torch.from_numpy(np.cumsum(counts) - counts), 0.4)
+    depths = torch.rand(len(samples), generator=generator) * 5 + 0.01
+    depths[::13], depths[1::17], depths[2::19], depths[3::23] = 0.0, 1e-30, 1e30, torch.inf
+    terms = replace(CASES[name].terms, depth_weight=0.7)
+    expected = sparse_loss(terms, colors.double(), targets.double(), samples, DepthPair(depths.double(), known))
+    given = terms, colors.to(DEVICE), targets.to(DEVICE), samples_to(samples, DEVICE)
+    found = training_kernels.sparse_loss(*given, DepthPair(depths.to(DEVICE), known.to(DEVICE)))
+    assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
+    gradients = found.depth_gradients.cpu()
+    assert gradients.isfinite().all() and torch.equal(gradients == 0, expected.depth_gradients.float() == 0)
+    assert relative(gradients, expected.depth_gradients) < 1e-5 and gradients.any()
+    without = training_kernels.sparse_loss(*given)
+    assert without.depth_gradients is None and torch.equal(without.color_gradients, found.color_gradients)
 
 
 @pytest.mark.parametrize("rate", [0.1, 1.0])
@@ -178,6 +205,6 @@ def test_lost_losses_are_counted_once(name):
     for value, expected in ((0.5, 0), (1e38, 1), (0.5, 1), (1e38, 2)):
         colors[::7] = value
         found = training_kernels.sparse_loss(
-            CASES[name].terms, colors.to(DEVICE), targets.to(DEVICE), samples_to(samples, DEVICE), update
+            CASES[name].terms, colors.to(DEVICE), targets.to(DEVICE), samples_to(samples, DEVICE), update=update
         )
         assert int(counter) == expected and bool(torch.isfinite(found.loss)) == (value == 0.5)

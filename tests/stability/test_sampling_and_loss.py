@@ -33,6 +33,7 @@ def test_training_on_any_errors_keeps_maps_and_samples_valid(
     for view_id, (width, height) in enumerate(sizes):
         maps.initialise(view_id, torch.tensor(rng.choice(palette, width * height), dtype=torch.float32))
     hard, stable = shares
+    importance *= unit == "pixel"
     sampler = ErrorGuidedPixelSampler(unit=unit, hard_ratio=hard, stable_ratio=stable, importance=importance)
     views = tuple(rng.permutation(len(sizes)).tolist())
     for iteration in (starts, starts + 1, starts + 40_000):

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from helpers.sampling_cases import SIGMAS, UNITS, random_maps, step, successive
+from helpers.sampling_cases import SIGMAS, random_maps, step, successive
 
 from turbogs_plugin.engine.reference.draws import Units, draw_units
 from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, random_words
@@ -141,12 +141,11 @@ def test_weights_make_sums_unbiased(stages, columns, wanted, tolerance):
         assert error < SIGMAS * estimates.std() / rows**0.5 + tolerance * quantity.sum()
 
 
-@pytest.mark.parametrize("unit", UNITS)
 @pytest.mark.parametrize("importance", [0.25, 1.0])
-def test_weights_have_mean_one_and_same_draw(unit, importance):
+def test_weights_have_mean_one_and_same_draw(importance):
     maps, views = random_maps(), (4, 0, 3)
-    plain = ErrorGuidedPixelSampler(unit=unit).sample(maps, views, 0.2, step(95))
-    weighted = ErrorGuidedPixelSampler(unit=unit, importance=importance).sample(maps, views, 0.2, step(95))
+    plain = ErrorGuidedPixelSampler().sample(maps, views, 0.2, step(95))
+    weighted = ErrorGuidedPixelSampler(importance=importance).sample(maps, views, 0.2, step(95))
     assert torch.equal(plain.pixel_ids, weighted.pixel_ids)
     weights = weighted.weights[weighted.filled]
     assert weights.dtype == torch.float32 and (weights > 0).all() and weights.std() > 0.01

@@ -51,12 +51,8 @@ RECORD, RADII = ScreenRecord.SIZE, 2
 
 
 class InPlace:
-    """This process's memory for passes and for the model, and views of every process's.
-
-    Args:
-        ranks: all processes.
-        share: gives memory that all read and write, or None; it is not asked again then.
-    """
+    """This process's memory for passes and for the model, and views of every process's. `share` gives memory that all
+    read and write, or None; it is not asked again then."""
 
     def __init__(self, ranks: ProcessRanks, share: Sharing) -> None:
         self._ranks, self._share, self._possible = ranks, share, True

@@ -83,11 +83,8 @@ def rows_of(count: int, processes: int) -> list[slice]:
 
 
 def gather_rows(ranks: ProcessRanks, tensors: Sequence[Tensor]) -> None:
-    """Overwrite all rows of some tensors by their owners', by a message that holds one tensor after the other.
-
-    Args:
-        tensors: [N, ...] each, contiguous, of four bytes an element.
-    """
+    """Overwrite all rows of some tensors by their owners', by a message that holds one tensor after the other. Each is
+    [N, ...], contiguous, of four bytes an element."""
     rows = rows_of(len(tensors[0]), ranks.count)
     flat = [value.view(torch.float32).view(len(value), -1) for value in tensors if value.numel()]  # [N, .] each
     widths = [value.shape[1] for value in flat]

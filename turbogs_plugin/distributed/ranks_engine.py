@@ -116,7 +116,10 @@ class RanksEngine:
         self._flags.append((self._passes, flags, event))
         self._passes += 1
         batch = Batch(rank, self.engine, self._exchange, gaussians, cameras, samples, options, shares)
-        return SharedRendered(colors, colors[:0, 0], None, batch, rendered)
+        depths = torch.zeros(len(samples), device=self.device) if options.with_depth else None
+        if depths is not None and rendered is not None:
+            depths[own.slots] = rendered.depths
+        return SharedRendered(colors, colors[:0, 0], depths, batch, rendered)
 
     def settle(self, wait: bool = False) -> int:
         while self._flags and (wait or self._flags[0][0] <= self._passes - LAG):
@@ -198,7 +201,8 @@ class Batch:
 
 @dataclass
 class SharedRendered(Rendered):
-    """One forward pass of several processes: `colors` are of all samples, `alphas` [0] and `depths` are not shared."""
+    """One forward pass of several processes: `colors` are of all samples, `alphas` are not there, and `depths` are this
+    process's alone, 0 for others': a depth term's gradient goes back where the depth came from."""
 
     batch: Batch
     _rendered: Rendered | None  # this process's share; None: it has no samples
@@ -211,9 +215,8 @@ class SharedRendered(Rendered):
         plain = None
         if self._rendered is not None:
             slots = self.batch.shares[self.batch.rank].slots
-            errors = None if upstream.pixel_errors is None else upstream.pixel_errors[slots]
-            own = self._rendered.backward(upstream.color_gradients[slots], errors, with_statistics=with_statistics)
-            plain = own.plain()
+            parts = {name: None if value is None else value[slots] for name, value in vars(upstream).items()}
+            plain = self._rendered.backward(**parts, with_statistics=with_statistics).plain()
         return SharedScreen(self.batch, plain)
 
 

@@ -44,14 +44,8 @@ class GaussianMoments:
         """The state of Gaussians that were never updated, with their dtype and device."""
         count, new = len(gaussians), gaussians.means.new_zeros
         packed, coefficients = (count, ParameterRow.SIZE), (count, gaussians.shN.shape[1] * 3)
-        return cls(
-            new(packed),
-            new(packed),
-            new(coefficients),
-            new(coefficients),
-            torch.zeros(count, dtype=torch.int32, device=gaussians.device),
-            torch.zeros((), dtype=torch.int64, device=gaussians.device),
-        )
+        steps, skipped = new(count, dtype=torch.int32), new((), dtype=torch.int64)
+        return cls(new(packed), new(packed), new(coefficients), new(coefficients), steps, skipped)
 
     def apply(self, update: RowUpdate) -> None:
         """Follow a change of the set of Gaussians."""

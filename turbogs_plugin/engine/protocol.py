@@ -19,6 +19,7 @@ from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, Rendered, RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.scene.depths import DepthPair
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.types import Cameras, Gaussians, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
@@ -75,8 +76,10 @@ class Engine(Protocol):
         """
 
     @abstractmethod
-    def evaluate(self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
-        """The loss of rendered samples and its gradient. `colors`, `targets`: [P, 3]."""
+    def evaluate(
+        self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, depths: DepthPair | None = None
+    ) -> LossOutput:
+        """The loss of rendered samples and its gradient. `colors`, `targets`: [P, 3]; `depths`: for a depth term."""
 
     def learn(self, samples: PixelSamples, colors: Tensor, output: LossOutput, update: MapUpdate) -> None:
         """Update the error maps (nothing is trained here) with the errors of an iteration, from any loss.
@@ -100,8 +103,10 @@ class Engine(Protocol):
         return output
 
     def supervise(self, terms: LossTerms, colors: Tensor, truth: PhotoSamples, update: MapUpdate) -> LossOutput:
-        """`evaluate` against the photos at the samples, then `learn`. `colors`: [P, 3], on the engine's device."""
-        return self.evaluate_and_learn(terms, colors, truth.colors(), truth.samples, update)
+        """`evaluate` against the truth at the samples, then `learn`. `colors`: [P, 3], on the engine's device."""
+        output = self.evaluate(terms, colors, truth.colors(), truth.samples, truth.depths)
+        self.learn(truth.samples, colors, output, update)
+        return output
 
     def expose(self, exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
         """[P, 3] float32: rendered colours [P, 3] as the exposure of each sample's photo shows them."""

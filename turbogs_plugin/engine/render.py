@@ -32,12 +32,7 @@ def rasterize(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **o
 
 
 def dense_samples(cameras: Cameras, view_ids: Sequence[int] | None = None) -> PixelSamples:
-    """Every pixel of some views, as samples without empty slots.
-
-    Args:
-        cameras: all V cameras.
-        view_ids: which of them; None for all.
-    """
+    """Every pixel of some of the cameras' views, None for all, as samples without empty slots."""
     view_ids = tuple(range(len(cameras)) if view_ids is None else view_ids)
     return dense_pixels(view_ids, cameras.sizes[list(view_ids)], cameras.viewmats.device)
 

@@ -31,7 +31,7 @@ class DrawRule:
         unit: one of `layout.SAMPLE_UNITS`.
         hard, stable: shares of the units drawn by error and by age; the mixed stage draws the rest.
         mixed_uniform: the mixed stage ignores error and age.
-        importance: a of the weights ``p^-a``; 0 for no weights.
+        importance: a of the weights ``p^-a`` of pixels; 0 for no weights.
         multiple: of unit ``pixel``: N_pix is the nearest multiple of this, which divides a tile's 256 pixels.
     """
 
@@ -104,6 +104,7 @@ class LossTerms:
         structure: one of `layout.STRUCTURES`.
         structure_weight: factor of the mean over tiles and channels of 1 - S, S the similarity.
         variance_constant: c of `ncc`, epsilon of `printed_ncc`.
+        depth_weight: factor of the depth term, where depths are given.
     """
 
     epsilon: float
@@ -111,6 +112,7 @@ class LossTerms:
     structure: str = "none"
     structure_weight: float = 0.0
     variance_constant: float = STRUCTURE_CONSTANT
+    depth_weight: float = 0.0
 
     @property
     def balance(self) -> bool:

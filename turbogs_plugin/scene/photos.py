@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.types import BLACK, Color, PixelSamples
+
+if TYPE_CHECKING:
+    from turbogs_plugin.scene.depths import DepthPair
 
 PHOTO_BYTES = 3
 """Bytes of a pixel of an opaque photo; a transparent one has one more."""
@@ -69,11 +73,13 @@ class Photos:
 
 @dataclass(frozen=True)
 class PhotoSamples:
-    """Ground truth of an iteration, not gathered yet: the kernel of the loss reads the photos itself."""
+    """Ground truth of an iteration, not gathered yet: the kernel of the loss reads the photos itself. `depths`: for a
+    loss with a depth term."""
 
     photos: Photos
     samples: PixelSamples
     background: Color = BLACK
+    depths: DepthPair | None = None
 
     @property
     def starts(self) -> np.ndarray:

@@ -23,6 +23,7 @@ from turbogs_plugin.model.limits import RESTRAIN_EVERY, Clearance, restrain_dist
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.plan.photo_gains import PhotoGains
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.depths import DepthPair, InverseDepths
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.train.training_state import TrainingState
 from turbogs_plugin.types import GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
@@ -52,6 +53,9 @@ class Trainer(TrainingState):
         self.schedule = config.build("schedule")
         self.pixel_sampler = config.build("pixel_sampler")
         self.loss = config.build("loss")
+        self.depths: InverseDepths | None = None
+        if self.loss.terms is not None and self.loss.terms.depth_weight > 0:
+            self.depths = InverseDepths.of(scene.train, scene.points).to(device)
         self.clearance: Clearance | None = None
         if config.train.camera_clearance and not scene.drawn_points:
             self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)
@@ -86,15 +90,18 @@ class Trainer(TrainingState):
         cameras = self.views.cameras.select(view_ids)
         share = float(self.config.train.dropout) if self.iteration < DROPOUT_UNTIL * self.iterations else 0.0
         dropout = Dropout(share, step.seed, self.iteration)
-        options = RenderOptions(self.sh_degree, self.config.raster, background=background, dropout=dropout)
+        options = RenderOptions(self.sh_degree, self.config.raster, self.depths is not None, background, dropout)
         rendered = self.engine.render(self.gaussians, cameras, samples, options)
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
+        if self.depths is not None:
+            truth = replace(truth, depths=DepthPair(rendered.depths, self.depths))
         loss = self.supervise(rendered.colors, truth, step)
 
         # 8) Backward to the screen, summing for each Gaussian what step 11 needs (errors, weights, squares)
         stats = self.density.stats
-        screen = rendered.backward(loss.color_gradients, loss.pixel_errors, with_statistics=stats is not None)
+        given = {"with_statistics": stats is not None, "depth_gradients": loss.depth_gradients}
+        screen = rendered.backward(loss.color_gradients, loss.pixel_errors, **given)
 
         # 9) and 10) Backward to the parameters, solve for their updates and apply them; adds to `stats`
         self.update(screen, stats, step)

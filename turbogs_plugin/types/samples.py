@@ -21,14 +21,8 @@ PATCH_WIDTH, PATCH_HEIGHT = 8, 4
 
 
 def sample_order(x: Tensor, y: Tensor) -> Tensor:
-    """Rank of a pixel within its tile: row-major over patches of 8x4, then row-major within the patch.
-
-    Args:
-        x, y: integer tensors of one shape, coordinates within the tile, 0 .. TILE_SIZE - 1.
-
-    Returns:
-        Integers 0 .. TILE_SIZE^2 - 1 of the same shape.
-    """
+    """Rank of a pixel within its tile, 0 .. TILE_SIZE^2 - 1: row-major over patches of 8x4, then within the patch. `x`,
+    `y`: integer tensors of one shape, coordinates within the tile."""
     patch = (y // PATCH_HEIGHT) * (TILE_SIZE // PATCH_WIDTH) + x // PATCH_WIDTH
     return patch * (PATCH_WIDTH * PATCH_HEIGHT) + (y % PATCH_HEIGHT) * PATCH_WIDTH + x % PATCH_WIDTH
 
@@ -209,8 +203,10 @@ class LossOutput:
         loss: scalar.
         color_gradients: [P, 3], d loss / d rendered colour.
         pixel_errors: [P] float32, L1 norm over RGB of the residual (0 .. 3); zero in empty slots.
+        depth_gradients: [P], d loss / d rendered depth; None: the loss has no such term.
     """
 
     loss: Tensor
     color_gradients: Tensor
     pixel_errors: Tensor
+    depth_gradients: Tensor | None = None

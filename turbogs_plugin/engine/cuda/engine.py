@@ -83,12 +83,13 @@ class CudaEngine(SharedEngine):
         aligned = len(photos) == len(update.maps.errors) and truth.starts.tolist() == starts.tolist()
         targets = photos if aligned else truth.colors()
         shared = self.overflow, truth.background, self.workspace
-        return training.sparse_loss(terms, colors, targets, truth.samples, update, *shared)
+        return training.sparse_loss(terms, colors, targets, truth.samples, truth.depths, update, *shared)
 
     def evaluate_and_learn(
         self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
     ) -> LossOutput:
-        return training.sparse_loss(terms, colors, targets, samples, update, self.overflow, workspace=self.workspace)
+        shared = {"overflow": self.overflow, "workspace": self.workspace}
+        return training.sparse_loss(terms, colors, targets, samples, update=update, **shared)
 
     def learn_exposures(
         self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float

@@ -2,9 +2,9 @@
 
 Each function does what its torch twin in `engine.reference` defines: `draws.draw_pixels`, `losses.sparse_loss` with
 `ErrorMaps.update`, `raster.ReferenceScreenGradients.parameter_gradients` with `update.apply_update`, and
-`engine.exposures`. It is enqueued on
-torch's current stream and does not wait. Tensors must be contiguous. A wrong device, dtype or shape, or a batch without
-a view or with more than `MAX_VIEWS`, raises `RuntimeError`, which names the tensor and what was expected.
+`engine.exposures`. It is enqueued on torch's current stream and does not wait. Tensors must be contiguous. A wrong
+device, dtype or shape, or a batch without a view or with more than `MAX_VIEWS`, raises `RuntimeError`, which names the
+tensor and what was expected.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from turbogs_plugin.engine.render_pass import ScreenGradients
 from turbogs_plugin.engine.rules import DrawRule, LossTerms, UpdateRule
 from turbogs_plugin.engine.shared import ModelCopies
 from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.scene.depths import CELL, DepthPair
 from turbogs_plugin.tiles import TILE_PIXELS, DrawEnds
 from turbogs_plugin.types import BLACK, Color, Gaussians, GaussianStats, LossOutput, PixelSamples, Step, TileGrid
 
@@ -51,7 +52,7 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
     chosen, slots, draws = _places(rule, ends, tiles, live_starts)
     scratch = launches.NO_SCRATCH
     if by_tile:
-        dtypes = {"errors": torch.float64, "ages": torch.int32, "keys": torch.int64, "missed": torch.float32}
+        dtypes = {"errors": torch.float64, "ages": torch.int32, "keys": torch.int64}
         empty = partial(torch.empty, sum(tiles), device=device)
         scratch = SimpleNamespace(**{f"tile_{name}": empty(dtype=dtype) for name, dtype in dtypes.items()})
     parts = slots, chosen, chosen + 1
@@ -132,6 +133,7 @@ def sparse_loss(
     colors: Tensor,
     targets: Tensor,
     samples: PixelSamples,
+    depths: DepthPair | None = None,
     update: MapUpdate | None = None,
     overflow: Tensor | None = None,
     background: Color = BLACK,
@@ -163,6 +165,7 @@ def sparse_loss(
         loss=torch.zeros((), dtype=torch.float64, device=colors.device) if workspace is None else workspace.zero(),
         color_gradients=buffers.floats("color_gradients", slots, 3),
         pixel_errors=buffers.floats("pixel_errors", slots),
+        depth_gradients=None if depths is None else buffers.floats("depth_gradients", slots),
     )
     loss = launches.SparseLoss(
         colors=colors,
@@ -181,6 +184,10 @@ def sparse_loss(
         nonfinite_losses=nonfinite_losses,
         overflow=overflow,
         background=launches.Background(*background),
+        depths=None if depths is None else plain_floats(depths.rendered),
+        known=launches.NO_DEPTHS if depths is None else depths.known,
+        cell=CELL,
+        depth_factor=0.0 if depths is None else terms.depth_weight / depths.known.share,
     )
     library.launch(loss)
     return output

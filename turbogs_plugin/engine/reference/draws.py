@@ -24,13 +24,13 @@ The draw is defined down to the bit, so that `draw_pixels` here and its CUDA twi
      each rounded to float32. S and B are the exact sums of E and A over all units of the tile (of the view for unit =
      tile), drawn or not, rounded to float32. A quotient by zero counts as 0. For `mixed` = uniform, M = 1.
 
-Importance weights are ``w = p^-a`` over their mean. p is the probability that a unit is drawn, given the keys of the
-others ("rank conditioning", Cohen and Kaplan 2007: dividing by it makes a single stage exactly unbiased). In a stage,
-tau is the least key with which the unit would have been taken. For a unit that the stage takes, it is the largest key
-left (none if the stage takes all). For any other unit, drawn before or not at all, it is the smallest key taken. If
-tau stands below for the number in its high bits, the probability of a stage is ``1 - exp(-max(E or M, 2^-100) / tau)``
-in a race, ``clamp(((A + 1) << 24) - tau, 0, 2^24) / 2^24`` in the stable stage, and 1 without a tau. It is 0 for a
-stage that takes nothing. Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all units of a
+Importance weights, of pixels alone, are ``w = p^-a`` over their mean. p is the probability that a pixel is drawn, given
+the keys of the others ("rank conditioning", Cohen and Kaplan 2007: dividing by it makes a single stage exactly
+unbiased). In a stage, tau is the least key with which the pixel would have been taken. Of one that the stage takes, it
+is the largest key left (none if the stage takes all); of any other, drawn before or not at all, the smallest key taken.
+With tau for the number in its high bits, the probability of a stage is ``1 - exp(-max(E or M, 2^-100) / tau)`` in a
+race, ``clamp(((A + 1) << 24) - tau, 0, 2^24) / 2^24`` in the stable stage, and 1 without a tau. It is 0 for a stage
+that takes nothing. Together, ``p = 1 - (1 - p_hard) (1 - p_stable) (1 - p_mixed)``, and 1 where all units of a
 row are drawn.
 
 Where maps have masks, a masked pixel is no unit, adds to no sum, and is in no tile that is drawn. A tile without
@@ -125,10 +125,6 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
     return drawn, torch.where(complete, 1.0, 1.0 - missed)
 
 
-def _importance_weights(probabilities: Tensor, rule: DrawRule) -> Tensor:
-    return probabilities.clamp(min=2.0**-24) ** -rule.importance
-
-
 def _share(values: Tensor, sums: Tensor) -> Tensor:
     """``values / sums``, 0 where the sum is 0."""
     return torch.where(sums > 0, values / sums, 0.0)
@@ -165,14 +161,13 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
 
     live = None if tile_ids is None else tuple(counts.tolist())
     if rule.unit == "tile":
-        chosen, weights, wanted = _draw_tiles(errors.sum(dim=1), ages.amax(dim=1), counts, words, rate, rule)
-        table, drawn, slots = table[chosen], exist[chosen], np.full(len(chosen), TILE_PIXELS)
-        weights = None if weights is None else weights[:, None].expand(table.shape)
+        chosen, wanted = _draw_tiles(errors.sum(dim=1), ages.amax(dim=1), counts, words, rate, rule)
+        table, drawn, slots, weights = table[chosen], exist[chosen], np.full(len(chosen), TILE_PIXELS), None
         tile_ids = chosen if tile_ids is None else tile_ids[chosen]
     else:
         wanted = [rule.wanted(rate, TILE_PIXELS)] * len(counts)
         drawn, probabilities = draw_units(Units(errors, ages, exist, words(table, PURPOSE_PIXELS), wanted[0]), rule)
-        weights = None if probabilities is None else _importance_weights(probabilities, rule)
+        weights = None if probabilities is None else probabilities.clamp(min=2.0**-24) ** -rule.importance
         slots = np.minimum(wanted[0], tile_areas(sizes)) if live is None else np.full(len(table), wanted[0])
         tile_ids = torch.arange(len(table), device=device) if tile_ids is None else tile_ids
     full = rule.unit == "pixel" and live is None
@@ -187,34 +182,22 @@ def _draw_tiles(
     words: Callable[[Tensor, int], Words],
     rate: float,
     rule: DrawRule,
-) -> tuple[Tensor, Tensor | None, list[int]]:
-    """Whole tiles as units, drawn from each view.
-
-    Args:
-        errors, ages: [T] of the tiles.
-        counts: [K] tiles of each view.
-        words: gives the random words of places [T, 1].
-
-    Returns:
-        Positions of the chosen tiles among the T, and their importance weights, if any; the number chosen of each view.
-    """
+) -> tuple[Tensor, list[int]]:
+    """Positions of whole tiles, drawn from each view, among the T; the number drawn of each view. `errors`, `ages`:
+    [T] of the tiles; `counts`: [K] tiles of each view; `words` gives the random words of places [T, 1]."""
     device, ends = errors.device, np.concatenate([[0], np.cumsum(counts)])
     tiles = torch.arange(len(errors), device=device)
     firsts = torch.as_tensor(np.repeat(ends[:-1], np.diff(ends)), device=device)
     of_tiles = words((tiles - firsts)[:, None], PURPOSE_TILES)  # of the numbers within the view
-    chosen, weights, numbers = [], [], []
+    chosen, numbers = [], []
     for first, end in itertools.pairwise(ends.tolist()):
         row = slice(first, end)
         wanted = rule.wanted(rate, end - first)
         numbers.append(wanted)
         exist = torch.ones(1, end - first, dtype=torch.bool, device=device)
         x0, x1, x2, x3 = (word[row].T for word in of_tiles)
-        drawn, probabilities = draw_units(
-            Units(errors[None, row], ages[None, row], exist, (x0, x1, x2, x3), wanted), rule
-        )
+        drawn, _ = draw_units(Units(errors[None, row], ages[None, row], exist, (x0, x1, x2, x3), wanted), rule)
         # Their number is known here; a boolean index would wait for the device.
         tile_ids = torch.argsort(drawn[0].to(torch.int8), stable=True, descending=True)[:wanted]
         chosen.append(first + tile_ids)
-        if probabilities is not None:
-            weights.append(_importance_weights(probabilities, rule)[0, tile_ids])
-    return torch.cat(chosen), torch.cat(weights) if weights else None, numbers
+    return torch.cat(chosen), numbers

@@ -34,30 +34,18 @@ class Intersections:
     row_order: Tensor
 
     def sum_by_row(self, values: Tensor) -> Tensor:
-        """Sum the values of the intersections of each row, in a fixed order.
-
-        Args:
-            values: [M, C]; `values[slots[i]]` belongs to intersection ``i``.
-
-        Returns:
-            [R, C].
-        """
+        """[R, C]: sums over the intersections of each row, in a fixed order, of values [M, C], of which
+        `values[slots[i]]` belongs to intersection ``i``."""
         sums = torch.segment_reduce(values, "sum", lengths=self.row_counts, axis=0, unsafe=True)
         return torch.zeros_like(sums).index_copy(0, self.row_order, sums)
 
 
 def smallest_exponents(conics: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """A lower bound, tight to rounding, of ``sigma = (a dx^2 + c dy^2) / 2 + b dx dy`` over rectangles.
+    """[C]: a lower bound, tight to rounding, of ``sigma = (a dx^2 + c dy^2) / 2 + b dx dy`` over rectangles. `conics`:
+    [C, 3]; `low`, `high`: [C, 2] corners of the rectangles relative to the splats' centres.
 
     If a convex form has its minimum outside a rectangle, its smallest value there is on one of the two edges that face
     the minimum. Along an edge it is a parabola. If the minimum is inside, both candidates below are zero.
-
-    Args:
-        conics: [C, 3].
-        low, high: [C, 2] corners of the rectangles relative to the splats' centres.
-
-    Returns:
-        [C].
     """
     a, b, c = conics.unbind(dim=-1)
     near_x, near_y = torch.zeros_like(low).clamp(min=low, max=high).unbind(dim=-1)

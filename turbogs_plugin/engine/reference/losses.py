@@ -19,14 +19,20 @@ from torch import Tensor
 
 from turbogs_plugin.engine.layout import WINDOW_RADIUS
 from turbogs_plugin.engine.rules import LUMINANCE_CONSTANT, STRUCTURE_CONSTANT, WINDOW_SIGMA, LossTerms
+from turbogs_plugin.scene.depths import DepthPair
 from turbogs_plugin.types import TILE_SIZE, LossOutput, PixelSamples
 
 BALANCE_EPSILON = 1e-8
 """Keeps the paper's lambda, the gradient-balanced weight, defined where the structure term has no gradient."""
 
+INVERSE_DEPTH_MAX = 1000.0
+"""Largest inverse depth in a loss, of a tenth of the near plane's depth: its square, in the gradient, stays bounded."""
 
-def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
-    """The loss of some samples and its gradient::
+
+def sparse_loss(
+    terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, depths: DepthPair | None = None
+) -> LossOutput:
+    """The loss of some samples and its gradient, to which `depth_loss` adds with `depths`::
 
         L = l1_weight * l1 + structure_weight * mean over tiles of f * mean over channels of (1 - S)
         f = lambda where `LossTerms.balance`, else 1
@@ -43,9 +49,12 @@ def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: Pixe
         samples: the P slots.
     """
     problem = _Problem(colors, targets, samples, terms.epsilon)
-    loss, gradients = terms.l1_weight * problem.loss, terms.l1_weight * problem.gradients
+    loss, gradients, depth_gradients = terms.l1_weight * problem.loss, terms.l1_weight * problem.gradients, None
+    if depths is not None:
+        of_depth, depth_gradients = depth_loss(terms, depths, samples)
+        loss = loss + of_depth
     if terms.structure == "none":
-        return LossOutput(loss, gradients, problem.pixel_errors)
+        return LossOutput(loss, gradients, problem.pixel_errors, depth_gradients)
     groups = problem.groups
     similarity, slopes = SIMILARITIES[terms.structure](problem, terms.variance_constant)
     factors = torch.ones_like(similarity[:, :1])  # [T, 1]
@@ -56,7 +65,29 @@ def sparse_loss(terms: LossTerms, colors: Tensor, targets: Tensor, samples: Pixe
     factors = factors * (terms.structure_weight / (3 * max(1, groups.tiles)))
     loss = loss + (factors * (1.0 - similarity)).sum()
     gradients = gradients - groups.spread(factors.expand_as(similarity)) * groups.shares * slopes
-    return LossOutput(loss, gradients, problem.pixel_errors)
+    return LossOutput(loss, gradients, problem.pixel_errors, depth_gradients)
+
+
+def depth_loss(terms: LossTerms, depths: DepthPair, samples: PixelSamples) -> tuple[Tensor, Tensor]:
+    """The depth term of Algorithm 1, and its gradient by each rendered depth [P]::
+
+        depth_weight / share * mean over filled samples of w * (sqrt(r^2 + eps^2) - eps),  r = 1 / d - 1 / d*
+
+    r is 0 where no d* is known or nothing was rendered (d = 0), and where an inverse depth exceeds `INVERSE_DEPTH_MAX`
+    or is not finite. By `InverseDepths.share` it is a mean over the samples that can be expected to have a d*.
+    """
+    rendered = depths.rendered.detach()
+    truth = depths.known.at(samples).to(rendered.dtype)
+    inverse = 1.0 / rendered
+    used = samples.filled & (rendered > 0) & (inverse <= INVERSE_DEPTH_MAX)
+    used = used & (truth > 0) & (truth <= INVERSE_DEPTH_MAX)
+    inverse, difference = torch.where(used, inverse, 0.0), torch.where(used, inverse - truth, 0.0)
+    weights = terms.depth_weight / (depths.known.share * samples.filled.sum().clamp(min=1))
+    weights = weights if samples.weights is None else weights * samples.weights
+    roots = torch.sqrt(difference * difference + terms.epsilon**2)
+    slopes = difference / roots
+    loss = (weights * difference * slopes * (roots / (roots + terms.epsilon))).sum()
+    return loss, -weights * slopes * inverse * inverse
 
 
 def tile_moments(problem: _Problem) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

@@ -51,15 +51,11 @@ Words = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def philox4x32(counter: Iterable[Any], key: tuple[Any, Any]) -> tuple[Any, Any, Any, Any]:
-    """Philox4x32-10.
+    """Philox4x32-10: four int64 tensors (or numpy arrays) of values 0 .. 2^32 - 1.
 
     Args:
-        counter: four int64 tensors (or numpy arrays), each holding values 0 .. 2^32 - 1; the first has the shape of the
-            result, the others broadcast to it, or are numbers.
+        counter: four more of these; the first has the shape of the result, the others broadcast to it, or are numbers.
         key: two such numbers, or arrays of them that broadcast to the first counter.
-
-    Returns:
-        Four int64 tensors (or arrays), each holding values 0 .. 2^32 - 1.
     """
     c0, c1, c2, c3 = counter
     c2 = c2 + 0 * c0
@@ -80,12 +76,8 @@ def philox4x32(counter: Iterable[Any], key: tuple[Any, Any]) -> tuple[Any, Any, 
 
 
 def random_words(place: Tensor, view: Tensor | int, purpose: int, seed: int, iteration: int) -> Words:
-    """The four random words of each place, in the layout above.
-
-    Args:
-        place: int64, any shape, values 0 .. 2^32 - 1.
-        view: int64 tensor that broadcasts to `place`, or a number.
-    """
+    """The four random words of each place, in the layout above. `place`: int64, any shape, values 0 .. 2^32 - 1;
+    `view`: int64 tensor that broadcasts to `place`, or a number."""
     return philox4x32((place, view, purpose, seed >> 32 & MASK), (seed & MASK, iteration & MASK))
 
 

@@ -97,14 +97,7 @@ def drawable_rows(
 
 
 def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices of quaternions of any norm.
-
-    Args:
-        quats: [R, 4] wxyz.
-
-    Returns:
-        [R, 3, 3].
-    """
+    """[R, 3, 3]: rotation matrices of quaternions [R, 4], wxyz, of any norm."""
     size = quats.detach().abs().amax(dim=-1, keepdim=True)
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
     # Dividing by the largest component keeps the squares of tiny and huge quaternions in range.

@@ -22,15 +22,7 @@ def unit_directions(offsets: Tensor) -> Tensor:
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """The basis functions of degrees 1 .. `degree` at unit `directions`.
-
-    Args:
-        directions: [R, 3].
-        degree: 0 .. 3.
-
-    Returns:
-        [R, num_bands(degree)].
-    """
+    """[R, num_bands(degree)]: the basis functions of degrees 1 .. `degree`, 0 .. 3, at unit `directions` [R, 3]."""
     x, y, z = directions.unbind(dim=-1)
     values = []
     if degree >= 1:
@@ -51,14 +43,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def evaluate(sh0: Tensor, shN: Tensor, directions: Tensor, degree: int) -> Tensor:
-    """Colours before the offset of 0.5 and the clamp.
-
-    Args:
-        sh0: [R, 1, 3], shN: [R, B, 3] with at least `num_bands(degree)` bands.
-        directions: [R, 3] unit vectors from the camera centre to the Gaussian.
-
-    Returns:
-        [R, 3].
-    """
+    """[R, 3]: colours before the offset of 0.5 and the clamp. `sh0`: [R, 1, 3]; `shN`: [R, B, 3], with at least
+    `num_bands(degree)` bands; `directions`: [R, 3] unit vectors from the camera centre to the Gaussian."""
     values = basis(directions, degree)  # [R, B]
     return SH_C0 * sh0[:, 0] + (values[:, :, None] * shN[:, : values.shape[1]]).sum(dim=1)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from turbogs_plugin.engine.rules import Dropout, LossTerms, ParameterRates
     from turbogs_plugin.error_maps import ErrorMaps
     from turbogs_plugin.masks import PixelMasks
+    from turbogs_plugin.scene.depths import InverseDepths
     from turbogs_plugin.types import Gaussians, GaussianStats, LossOutput, PixelSamples
 else:  # the fields that launches read of these
     Gaussians = fields_of(Tensor="means quats scales opacities sh0 shN")  # quats and shN 16-byte aligned
@@ -44,12 +45,13 @@ else:  # the fields that launches read of these
     Dropout = fields_of(int="threshold seed iteration")
     Upstream = fields_of(Tensor="color_gradients alpha_gradients depth_gradients pixel_errors")
     GaussianMoments = fields_of(Tensor="exp_avg exp_avg_sq exp_avg_shN exp_avg_sq_shN steps skipped")
-    TileScratch = fields_of(Tensor="tile_errors tile_ages tile_keys tile_missed")  # by tile of the batch
+    TileScratch = fields_of(Tensor="tile_errors tile_ages tile_keys")  # by tile of the batch
     Copies = fields_of(int="copy_0 copy_1 copy_2 copy_3 copy_4 copy_5 copy_6")
     ParameterRates = fields_of(float="means quats scales opacities sh0 shN")
     PixelMasks = fields_of(Tensor="tiles rows bits")  # [L] int32, [L] int32, [B, 8] int32
     LossTerms = fields_of(float="epsilon l1_weight structure_weight variance_constant", bool="balance")
-    LossOutput = fields_of(Tensor="loss color_gradients pixel_errors")
+    LossOutput = fields_of(Tensor="loss color_gradients pixel_errors depth_gradients")
+    InverseDepths = fields_of(Tensor="cells starts")  # [Y] float32, [V] int64
     ErrorMaps = fields_of(Tensor="errors stamps view_sums")  # [X] float16, [X] int16, [V] float64
     Exposures = fields_of(Tensor="offsets exp_avg exp_avg_sq steps")
 
@@ -60,7 +62,8 @@ NO_STATS: Any = SimpleNamespace(**dict.fromkeys(GaussianStats.__annotations__))
 NO_MASKS: Any = SimpleNamespace(**dict.fromkeys(PixelMasks.__annotations__))
 NO_SCRATCH: Any = SimpleNamespace(**dict.fromkeys(TileScratch.__annotations__))
 NO_MAPS: Any = SimpleNamespace(**dict.fromkeys(ErrorMaps.__annotations__))
-"""Arguments of a launch without copies, statistics, masks, tiles to draw, or maps."""
+NO_DEPTHS: Any = SimpleNamespace(**dict.fromkeys(InverseDepths.__annotations__))
+"""Arguments of a launch without copies, statistics, masks, tiles to draw, maps, or known depths."""
 
 
 @dataclass
@@ -252,7 +255,7 @@ class SamplePixels(Launch):
     iteration: int
     now: int  # a stamp's age is `now` less the stamp
     samples: PixelSamples  # weights are None without importance
-    scratch: TileScratch  # float64, int32, int64 and float32; None for unit = pixel
+    scratch: TileScratch  # float64, int32 and int64; None for unit = pixel
 
 
 @dataclass
@@ -275,6 +278,10 @@ class SparseLoss(Launch):
     nonfinite_losses: Tensor | None  # [] int64, 1 is added if the loss is not finite
     overflow: Tensor | None  # [1] int32; if not 0, the maps stay as they are
     background: Background  # shows through photos with an alpha
+    depths: Tensor | None  # [P] float32, rendered; None: no depth term
+    known: InverseDepths
+    cell: int  # its side, pixels
+    depth_factor: float
 
 
 @dataclass

@@ -1,0 +1,82 @@
+"""Depths that a capture knows at pixels of its photos: d* of Algorithm 1, by which a loss may pull rendered depths."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.photos import pixel_offsets
+from turbogs_plugin.scene.scene import PosedImages
+from turbogs_plugin.types import PixelSamples
+
+CELL = 4
+"""Side in pixels of a cell, all of which has the depth of the point that the photo shows in it. On a surface turned
+away by an angle a that is off by at most ``4 sqrt(2) tan(a) / focal length`` of itself; at an edge by any amount."""
+FARTHEST_MATCH = 2.0
+"""Pixels between a point and where a photo shows it, along an axis, beyond which the pair tells no depth."""
+
+
+@dataclass(frozen=True)
+class InverseDepths:
+    """Inverse depths of V training views, along their cameras' axes: one for each cell of `CELL` x `CELL` pixels.
+
+    Args:
+        cells: [Y] float32, row by row and view after view, over the scene's unit; 0 where none is known.
+        starts: [V] int64, the first cell of each view.
+        share: of all pixels those whose depth is known, above 0.
+    """
+
+    cells: Tensor
+    starts: Tensor
+    share: float
+
+    @classmethod
+    def of(cls, views: PosedImages, points: Tensor) -> InverseDepths:
+        """Depths of the points [M, 3] that photos show; of several in a cell the nearest. They are free of cost, and as
+        exact as the reconstruction.
+
+        Raises:
+            InputError: no depth is known.
+        """
+        shapes = -(-views.cameras.sizes // CELL)  # [V, 2]
+        starts = pixel_offsets(shapes)
+        cells = np.zeros(starts[-1], dtype=np.float32)
+        shown = views.observations
+        if shown is not None and len(shown):
+            viewmats, Ks = (getattr(views.cameras, name).cpu().double().numpy() for name in ("viewmats", "Ks"))
+            viewmats, Ks, shape = viewmats[shown.view_ids], Ks[shown.view_ids], shapes[shown.view_ids]  # [O, ...]
+            places = points.cpu().double().numpy()[shown.point_ids]
+            with np.errstate(all="ignore"):  # points may lie in a camera
+                places = np.einsum("oij,oj->oi", viewmats[:, :3, :3], places) + viewmats[:, :3, 3]
+                inverse = 1.0 / places[:, 2]
+                away = np.einsum("oij,oj->oi", Ks[:, :2], places * inverse[:, None]) - shown.pixels
+            at = np.floor(shown.pixels / CELL).astype(np.int64)  # [O, 2]
+            told = (inverse > 0) & (np.abs(away) <= FARTHEST_MATCH).all(axis=1) & ((at >= 0) & (at < shape)).all(axis=1)
+            flat = starts[shown.view_ids] + at[:, 1] * shape[:, 0] + at[:, 0]
+            np.maximum.at(cells, flat[told], inverse[told].astype(np.float32))
+        share = np.count_nonzero(cells) * CELL**2 / views.cameras.sizes.prod(axis=1).sum()
+        if not share:
+            raise InputError("loss.depth_weight: this capture does not say where photos show its points: set it to 0")
+        return cls(torch.from_numpy(cells), torch.from_numpy(starts[:-1]), min(1.0, float(share)))
+
+    def to(self, device: torch.device | str) -> InverseDepths:
+        return InverseDepths(self.cells.to(device), self.starts.to(device), self.share)
+
+    def at(self, samples: PixelSamples) -> Tensor:
+        """[P] float32: inverse depths at the samples; 0 where none is known. In empty slots anything."""
+        views, slots = torch.as_tensor(samples.view_ids, device=self.cells.device), samples.view_of_slot()
+        widths = torch.as_tensor(-(-samples.sizes[:, 0] // CELL), device=self.cells.device)
+        x, y = (samples.coordinates() // CELL).unbind(dim=1)
+        return self.cells[self.starts[views][slots] + y * widths[slots] + x]
+
+
+@dataclass(frozen=True)
+class DepthPair:
+    """d and d* of an iteration: depths rendered at its samples [P], 0 for none, and the depths that are known."""
+
+    rendered: Tensor
+    known: InverseDepths
