@@ -38,7 +38,7 @@ CASES = {
     "one view": ("schedule.type=fixed", "schedule.views=1"),
     "one tile": ("schedule.type=fixed", "schedule.views=1", "schedule.pixel_budget=0.1", "pixel_sampler.unit=tile"),
     "tiles": ("pixel_sampler.unit=tile", "pixel_sampler.importance=0.5"),
-    "summed rows": ("optimizer.rows=summed",),
+    "rows of each view": ("optimizer.type=moment_lm",),
     "no rule": ("optimizer.type=adam",),
     # Its votes have a threshold, so the models must not part: a step where a gradient is only rounding has its sign.
     "fastgs": (
