@@ -138,7 +138,6 @@ void launches::SparseLoss::run(const Arguments<SparseLoss>& in) {
 
 namespace {
 
-constexpr float kRateMin = 1.0842021724855044e-19f;  // sqrt(FLT_MIN): the damping of a rate of zero stays finite
 
 // What both operators work on. `Launch` has the fields of Python's `ScreenBackward`.
 template <class Launch>
@@ -150,8 +149,6 @@ ScreenBackwardParams read_screen(const Arguments<Launch>& in) {
     const int64_t views = params.num_views, count = params.num_gaussians;
     in.set(params.records, T::records, {views, count, ScreenRecord::kSize});
     in.set(params.radii, T::radii, {views, count, 2});
-    in.set_optional(params.num_filled, T::num_filled, {1});
-    params.num_slots = to_int(in.integer(Launch::Integers::num_slots), "samples");
     in.set_optional(params.overflow, T::overflow, {1});
     if (in.has(T::error_sums)) {
         in.set(params.error_sums, T::error_sums, {count});
@@ -180,7 +177,6 @@ void launches::ProjectionBackward::run(const Arguments<ProjectionBackward>& in) 
     in.set(outputs.rows, Tensors::rows, {num_rows, count, ParameterRow::kSize});
     in.set(outputs.shN, Tensors::shN_gradients, {count, params.bands, 3});
     in.set(outputs.touched, Tensors::touched, {count});
-    in.set(outputs.view_losses, Tensors::view_losses, {num_rows, count});
     launch_projection_backward(params, outputs, in.stream());
 }
 
@@ -190,7 +186,6 @@ void launches::FusedStep::run(const Arguments<FusedStep>& in) {
     const double beta1 = in.real(Reals::beta1), beta2 = in.real(Reals::beta2);
     OptimizerParams optimizer = {};
     optimizer.kind = static_cast<UpdateKind>(in.integer(Integers::kind));
-    optimizer.rows_per_view = in.integer(Integers::rows_per_view) != 0;
     const auto set_rates = [&](int first, int size, Reals rate) {
         std::fill_n(optimizer.rates + first, size, in.number(rate));
     };
@@ -199,9 +194,6 @@ void launches::FusedStep::run(const Arguments<FusedStep>& in) {
     set_rates(ParameterRow::kQuats, 4, Reals::quats);
     set_rates(ParameterRow::kSh0, 3, Reals::sh0);
     set_rates(ParameterRow::kOpacities, 1, Reals::opacities);
-    for (int i = 0; i < ParameterRow::kSize; ++i) {
-        optimizer.inverse_rates[i] = 1.0f / std::max(optimizer.rates[i], kRateMin);
-    }
     optimizer.rate_shN = in.number(Reals::shN);
     optimizer.beta1 = static_cast<float>(beta1);
     optimizer.beta2 = static_cast<float>(beta2);
@@ -210,8 +202,6 @@ void launches::FusedStep::run(const Arguments<FusedStep>& in) {
     optimizer.log_beta1 = static_cast<float>(std::log(beta1));
     optimizer.log_beta2 = static_cast<float>(std::log(beta2));
     optimizer.eps = in.number(Reals::eps);
-    optimizer.curvature = in.number(Reals::curvature);
-    optimizer.max_step = in.number(Reals::max_step);
     constexpr Integers kCopies[kMaxPeers - 1] = {Integers::copy_0, Integers::copy_1, Integers::copy_2,
                                                  Integers::copy_3, Integers::copy_4, Integers::copy_5,
                                                  Integers::copy_6};

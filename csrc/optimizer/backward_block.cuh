@@ -164,17 +164,15 @@ __device__ __forceinline__ void add_sight(const ScreenBackwardParams& params, in
     atomicMax(reinterpret_cast<int*>(params.max_radii) + gaussian, __float_as_int(sight.largest));
 }
 
-// One Gaussian in the views that its masks name: gives each view's row, colour gradient and loss to `sink.add(view,
-// camera, row, color, loss)`, and the sums to the statistics. `views_of(first)` is the mask of a group of views. With
-// kSampledOnly, views in which no sample met the Gaussian are left out. Lanes go through their own views.
+// One Gaussian in the views that its masks name: gives each view's row and colour gradient to `sink.add(view, camera,
+// row, color)`, and the sums to the statistics. `views_of(first)` is the mask of a group of views. With kSampledOnly,
+// views in which no sample met the Gaussian are left out. Lanes go through their own views.
 template <bool kSampledOnly, class ViewsOf, class Sink>
 __device__ __forceinline__ void backward_views(const ScreenBackwardParams& params, const ViewCamera* cameras,
                                                const float* coefficients, int gaussian, const StoredGaussian& stored,
                                                const ViewsOf& views_of, Sink& sink) {
     float error_sum = 0.0f, distance_sum = 0.0f, weight_sum = 0.0f, grad_sum = 0.0f, absgrad_sum = 0.0f;
     float square_sum = 0.0f;
-    const int filled = params.num_filled != nullptr ? *params.num_filled : params.num_slots;
-    const float inverse_filled = 1.0f / static_cast<float>(max(filled, 1));
     const GaussianShape shape = make_shape(stored.mean, stored.log_scale, stored.quat);
     const float opacity = 1.0f / (1.0f + expf(-stored.logit));
 
@@ -195,7 +193,7 @@ __device__ __forceinline__ void backward_views(const ScreenBackwardParams& param
                               record[Place::kDepth], row);
             color_backward(shape, camera, stored.sh0, params.sh_degree, coefficients, grad_color, row);
             row[ParameterRow::kOpacities] = record[Place::kOpacity] * opacity * (1.0f - opacity);
-            sink.add(view, camera, row, grad_color, record[Place::kErrorSum] * inverse_filled);
+            sink.add(view, camera, row, grad_color);
 
             error_sum += record[Place::kErrorSum];
             distance_sum += record[Place::kDistanceSum];

@@ -19,12 +19,9 @@ constexpr int kStepBlocks = 3;           // of an SM: up to 168 registers, so th
 constexpr int kQuadBatch = 4;            // quads of harmonics that a thread has under way; measured with the rest
 constexpr int kSharedSlots = 4;          // rows of a Gaussian in shared memory; five were slower, 526 us for 485
 
-// A slot: a row, the loss of its view, its view (bits).
-constexpr int kLossPlace = ParameterRow::kSize, kViewPlace = kLossPlace + 1, kSlotFloats = kViewPlace + 1;
-static_assert(kSlotFloats == ScreenRecord::kSize, "a row that is kept takes the place of a record");
-
-// The rows of J: none (Adam), the sum of the views' rows, or each.
-enum class Rows { kNone, kSummed, kPerView };
+// A slot: a row, its view (bits), a spare float. A row that is kept takes the place of a record.
+constexpr int kViewPlace = ParameterRow::kSize, kSlotFloats = ScreenRecord::kSize;
+static_assert(kViewPlace < kSlotFloats);
 
 // Rows of a Gaussian that shared memory holds.
 __host__ __device__ int shared_slots(const ScreenBackwardParams& params) {
@@ -49,14 +46,12 @@ struct RowCollector {
     int num_slots;
     int count = 0;    // rows
     float sum[ParameterRow::kSize] = {};
-    float loss = 0.0f;
     bool finite = true;
     bool large = false;
 
-    __device__ __forceinline__ void add(int view, const ViewCamera&, const float row[ParameterRow::kSize], const float*,
-                                        float view_loss) {
-        float values[kSlotFloats];
-        values[kLossPlace] = view_loss;
+    __device__ __forceinline__ void add(int view, const ViewCamera&, const float row[ParameterRow::kSize],
+                                        const float*) {
+        float values[kSlotFloats] = {};
         values[kViewPlace] = __int_as_float(view);
 #pragma unroll
         for (int i = 0; i < ParameterRow::kSize; ++i) {
@@ -66,7 +61,6 @@ struct RowCollector {
             large = large || (of_color && !(fabsf(values[i]) < kLargeGradient));
             sum[i] += clip_gradient(values[i]);
         }
-        loss += view_loss;
         if (count < num_slots) {
             float* slot = slots + kSlotFloats * count;
 #pragma unroll
@@ -81,33 +75,27 @@ struct RowCollector {
         ++count;
     }
 
-    // kSize numbers of row `s` from kFirst on, and behind them its loss and its view.
+    // kSize numbers of row `s` from kFirst on, and behind them its view.
     template <int kFirst, int kSize>
-    __device__ __forceinline__ void get(int s, float (&values)[kSize + 2]) const {
+    __device__ __forceinline__ void get(int s, float (&values)[kSize + 1]) const {
         const auto read = [&](const float* slot) {
 #pragma unroll
             for (int i = 0; i < kSize; ++i) values[i] = slot[kFirst + i];
-            values[kSize] = slot[kLossPlace];
-            values[kSize + 1] = slot[kViewPlace];
+            values[kSize] = slot[kViewPlace];
         };
         if (s < num_slots) read(slots + kSlotFloats * s);
         else read(reinterpret_cast<const float*>(records + s * step));
     }
 
     // Adds to the system of a block of the parameters what the rows say of it.
-    template <Rows kRows, int kFirst, int kSize, class Weight>
-    __device__ __forceinline__ void add_to(DampedSystem<kSize>& system, const float* scale,
-                                           const Weight& weight_of) const {
-        if constexpr (kRows == Rows::kSummed) {
-            system.add(sum + kFirst, scale + kFirst, weight_of(loss));
-        } else {
-            for (int s = 0; s < count; ++s) {
-                float row[kSize + 2];
-                get<kFirst, kSize>(s, row);
+    template <int kFirst, int kSize>
+    __device__ __forceinline__ void add_to(DampedSystem<kSize>& system, const float* scale) const {
+        for (int s = 0; s < count; ++s) {
+            float row[kSize + 1];
+            get<kFirst, kSize>(s, row);
 #pragma unroll
-                for (int i = 0; i < kSize; ++i) row[i] = clip_gradient(row[i]);
-                system.add(row, scale + kFirst, weight_of(row[kSize]));
-            }
+            for (int i = 0; i < kSize; ++i) row[i] = clip_gradient(row[i]);
+            system.add(row, scale + kFirst);
         }
     }
 
@@ -115,12 +103,12 @@ struct RowCollector {
     __device__ __forceinline__ void harmonics(const float mean[3], const ViewCamera* cameras, int degree,
                                               float (&gradients)[3 * kMaxBands]) const {
         for (int s = 0; s < count; ++s) {
-            float row[3 + 2];
+            float row[3 + 1];
             get<ParameterRow::kSh0, 3>(s, row);
             float grad_color[3];
 #pragma unroll
             for (int c = 0; c < 3; ++c) grad_color[c] = row[c] * (1.0f / kShBand0);
-            add_harmonics_gradient(mean, cameras[__float_as_int(row[4])], degree, grad_color, gradients);
+            add_harmonics_gradient(mean, cameras[__float_as_int(row[3])], degree, grad_color, gradients);
         }
     }
 
@@ -147,20 +135,16 @@ __device__ __forceinline__ void put(const OptimizerParams& optimizer, T* place, 
 }
 
 // Moments, solution and new values of one Gaussian's 14 parameters.
-template <Rows kRows, bool kCopied>
+template <bool kSolve, bool kCopied>
 __device__ __forceinline__ void update_row(const ScreenBackwardParams& params, const OptimizerParams& optimizer,
                                            int gaussian, const RowCollector& rows, const StoredGaussian& old,
                                            float2 corrections) {
     const size_t first_pair = static_cast<size_t>(gaussian) * (ParameterRow::kSize / 2);
     Terms terms = advance(optimizer, rows.sum, corrections, optimizer.exp_avg + first_pair,
                           optimizer.exp_avg_sq + first_pair);
-    if (kRows != Rows::kNone) {
-        const auto geometry = [&](auto& system, const auto& weight_of) {
-            rows.add_to<kRows, kGeometryFirst>(system, terms.scale, weight_of);
-        };
-        const auto appearance = [&](auto& system, const auto& weight_of) {
-            rows.add_to<kRows, kAppearanceFirst>(system, terms.scale, weight_of);
-        };
+    if (kSolve) {
+        const auto geometry = [&](auto& system) { rows.add_to<kGeometryFirst>(system, terms.scale); };
+        const auto appearance = [&](auto& system) { rows.add_to<kAppearanceFirst>(system, terms.scale); };
         solve_block<kGeometryFirst, kGeometrySize>(optimizer, geometry, terms);
         solve_block<kAppearanceFirst, kAppearanceSize>(optimizer, appearance, terms);
     }
@@ -168,16 +152,16 @@ __device__ __forceinline__ void update_row(const ScreenBackwardParams& params, c
     using Place = ParameterRow;
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
-        put<kCopied>(optimizer, params.means + triple + i, __fadd_rn(old.mean[i], terms.adam[Place::kMeans + i]));
+        put<kCopied>(optimizer, params.means + triple + i, __fadd_rn(old.mean[i], terms.change[Place::kMeans + i]));
         put<kCopied>(optimizer, params.scales + triple + i,
-                     __fadd_rn(old.log_scale[i], terms.adam[Place::kScales + i]));
-        put<kCopied>(optimizer, params.sh0 + triple + i, __fadd_rn(old.sh0[i], terms.adam[Place::kSh0 + i]));
+                     __fadd_rn(old.log_scale[i], terms.change[Place::kScales + i]));
+        put<kCopied>(optimizer, params.sh0 + triple + i, __fadd_rn(old.sh0[i], terms.change[Place::kSh0 + i]));
     }
-    const float* turn = terms.adam + Place::kQuats;
+    const float* turn = terms.change + Place::kQuats;
     put<kCopied>(optimizer, params.quats + gaussian,
         make_float4(__fadd_rn(old.quat[0], turn[0]), __fadd_rn(old.quat[1], turn[1]), __fadd_rn(old.quat[2], turn[2]),
                     __fadd_rn(old.quat[3], turn[3])));
-    put<kCopied>(optimizer, params.opacities + gaussian, __fadd_rn(old.logit, terms.adam[Place::kOpacities]));
+    put<kCopied>(optimizer, params.opacities + gaussian, __fadd_rn(old.logit, terms.change[Place::kOpacities]));
 }
 
 // Adam on the harmonics of the block's updated Gaussians. Values and gradients come from shared memory.
@@ -246,7 +230,7 @@ __device__ __forceinline__ void update_harmonics(const ScreenBackwardParams& par
     }
 }
 
-template <Rows kRows, bool kCopied>
+template <bool kSolve, bool kCopied>
 __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kernel(
     const __grid_constant__ ScreenBackwardParams params, const __grid_constant__ OptimizerParams optimizer) {
     extern __shared__ float4 shared[];
@@ -288,7 +272,7 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
                                                    1.0f / bias_correction(optimizer.log_beta2, steps));
             optimizer.steps[gaussian] = steps;
             block_corrections[threadIdx.x] = corrections;
-            update_row<kRows, kCopied>(params, optimizer, gaussian, rows, load_gaussian(params, gaussian), corrections);
+            update_row<kSolve, kCopied>(params, optimizer, gaussian, rows, load_gaussian(params, gaussian), corrections);
             if (params.sh_degree > 0) rows.harmonics(stored.mean, block.cameras, params.sh_degree, gradients);
         } else if (rows.count > 0) {
             atomicAdd(optimizer.skipped, 1ull);
@@ -306,9 +290,8 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
 
 template <bool kCopied>
 void launch(const ScreenBackwardParams& params, const OptimizerParams& optimizer, cudaStream_t stream) {
-    const auto kernel = optimizer.kind == UpdateKind::kAdam ? fused_step_kernel<Rows::kNone, kCopied>
-                        : optimizer.rows_per_view           ? fused_step_kernel<Rows::kPerView, kCopied>
-                                                            : fused_step_kernel<Rows::kSummed, kCopied>;
+    const bool solve = optimizer.kind != UpdateKind::kAdam;
+    const auto kernel = solve ? fused_step_kernel<true, kCopied> : fused_step_kernel<false, kCopied>;
     launch_blocks(kernel, step_floats(params), params, optimizer, stream);
 }
 

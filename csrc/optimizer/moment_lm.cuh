@@ -61,21 +61,17 @@ __device__ __forceinline__ void adam(const OptimizerParams& optimizer, float gra
 template <int kSize>
 struct DampedSystem {
     float lower[kSize * (kSize + 1) / 2] = {};
-    bool has_rows = false;
 
     static __device__ __forceinline__ constexpr int at(int i, int j) { return i * (i + 1) / 2 + j; }
 
-    // Adds weight * row row^T, scaled, with the row cut to `kRowLimit`.
-    __device__ __forceinline__ void add(const float row[kSize], const float scale[kSize], float weight) {
+    // Adds row row^T, scaled, with the row cut to `kRowLimit`.
+    __device__ __forceinline__ void add(const float row[kSize], const float scale[kSize]) {
         float unit[kSize], largest = 0.0f, norm2 = 0.0f;
-        bool nonzero = false;
 #pragma unroll
         for (int i = 0; i < kSize; ++i) {
-            nonzero = nonzero || row[i] != 0.0f;
             unit[i] = row[i] * scale[i];
             largest = fmaxf(largest, fabsf(unit[i]));
         }
-        has_rows = has_rows || (nonzero && weight > 0.0f);
         const float inverse = approximate_reciprocal(fmaxf(largest, FLT_MIN));
 #pragma unroll
         for (int i = 0; i < kSize; ++i) {
@@ -83,7 +79,7 @@ struct DampedSystem {
             norm2 += unit[i] * unit[i];
         }
         const float norm = fmaxf(approximate_sqrt(norm2), FLT_MIN);
-        const float factor = fminf(largest * norm * approximate_sqrt(weight), kRowLimit) * approximate_reciprocal(norm);
+        const float factor = fminf(largest * norm, kRowLimit) * approximate_reciprocal(norm);
 #pragma unroll
         for (int i = 0; i < kSize; ++i) {
             unit[i] *= factor;
@@ -124,16 +120,15 @@ struct DampedSystem {
 
 // What the moments say of one Gaussian's 14 parameters after this step's gradient.
 struct Terms {
-    float mean[ParameterRow::kSize];   // right side: m, bias-corrected unless the step is the paper's
-    float scale[ParameterRow::kSize];  // damping^(-1/2)
-    float adam[ParameterRow::kSize];   // Adam's change
+    float mean[ParameterRow::kSize];    // right side: m
+    float scale[ParameterRow::kSize];   // damping^(-1/2)
+    float change[ParameterRow::kSize];  // Adam's, until a block is solved
 };
 
 // Advances the moments, in place, by the gradient.
 __device__ __forceinline__ Terms advance(const OptimizerParams& optimizer, const float gradient[ParameterRow::kSize],
                                          float2 corrections, float2* exp_avg, float2* exp_avg_sq) {
     constexpr int kPairs = ParameterRow::kSize / 2;
-    const bool paper = optimizer.kind == UpdateKind::kPaperLm;
     // All of it is read before anything is written: the compiler must take the arrays for one.
     float2 means[kPairs], squares[kPairs];
 #pragma unroll
@@ -148,13 +143,11 @@ __device__ __forceinline__ Terms advance(const OptimizerParams& optimizer, const
         float& square = c % 2 == 0 ? squares[c / 2].x : squares[c / 2].y;
         mean = decay(gradient[c], mean, optimizer.beta1, optimizer.one_minus_beta1);
         square = decay(__fmul_rn(gradient[c], gradient[c]), square, optimizer.beta2, optimizer.one_minus_beta2);
-        const float corrected = __fmul_rn(mean, corrections.x);
         const float denominator = denominator_of(square, corrections.y, optimizer.eps);
-        terms.adam[c] = -__fmul_rn(optimizer.rates[c], adam_direction(corrected, denominator));
-        const float damping =
-            paper ? approximate_sqrt(square) + optimizer.eps : denominator * optimizer.inverse_rates[c];
-        terms.mean[c] = paper ? mean : corrected;
-        terms.scale[c] = approximate_rsqrt(damping);
+        terms.change[c] =
+            -__fmul_rn(optimizer.rates[c], adam_direction(__fmul_rn(mean, corrections.x), denominator));
+        terms.mean[c] = mean;
+        terms.scale[c] = approximate_rsqrt(approximate_sqrt(square) + optimizer.eps);
     }
 #pragma unroll
     for (int pair = 0; pair < kPairs; ++pair) {
@@ -164,16 +157,11 @@ __device__ __forceinline__ Terms advance(const OptimizerParams& optimizer, const
     return terms;
 }
 
-// Solves the block of kSize parameters from kFirst on, and turns `terms.adam` into the change to make.
-// `add_rows(system, weight_of)` adds the rows.
+// Solves the block of kSize parameters from kFirst on: `terms.change`. `add_rows(system)` adds the rows.
 template <int kFirst, int kSize, class AddRows>
 __device__ __forceinline__ void solve_block(const OptimizerParams& optimizer, const AddRows& add_rows, Terms& terms) {
     DampedSystem<kSize> system;
-    const bool balanced = optimizer.kind == UpdateKind::kBalancedLm;
-    add_rows(system, [&](float loss) {
-        if (!balanced) return 1.0f;
-        return loss > 0.0f && is_finite(loss) ? fminf(optimizer.curvature / loss, FLT_MAX) : 0.0f;
-    });
+    add_rows(system);
     float x[kSize];
 #pragma unroll
     for (int i = 0; i < kSize; ++i) x[i] = terms.mean[kFirst + i] * terms.scale[kFirst + i];
@@ -181,16 +169,8 @@ __device__ __forceinline__ void solve_block(const OptimizerParams& optimizer, co
 #pragma unroll
     for (int i = 0; i < kSize; ++i) {
         const int c = kFirst + i;
-        float delta = -terms.scale[c] * x[i];
-        if (balanced) {
-            if (optimizer.max_step > 0.0f) {
-                const float bound = fmaxf(optimizer.max_step * optimizer.rates[c], fabsf(terms.adam[c]));
-                delta = fmaxf(fminf(delta, bound), -bound);
-            }
-            // Without rows the solution is Adam's step: that one is taken as it is.
-            if (!system.has_rows || !(optimizer.rates[c] > 0.0f)) delta = terms.adam[c];
-        }
-        terms.adam[c] = delta;
+        const float rate = optimizer.kind == UpdateKind::kUnscaledLm ? 1.0f : optimizer.rates[c];
+        terms.change[c] = -rate * (terms.scale[c] * x[i]);
     }
 }
 

@@ -10,8 +10,6 @@ namespace turbogs {
 struct ScreenBackwardParams : SceneParams {
     float4* records;            // [K, N, 4]; read where on screen; the fused step leaves rows in any of them
     const int2* radii;          // [K, N]; 0 where the Gaussian is off screen
-    const int32_t* num_filled;  // [1] filled slots of the batch; null where all are
-    int num_slots;              // P
     const int32_t* overflow;    // [1], or null; where set, the launch does nothing
 
     // GaussianStats, added to in place; all null where not wanted.
@@ -31,23 +29,18 @@ struct ProjectionBackwardOutputs {
     float2* rows;        // [K, N, 14] or [1, N, 14]
     float* shN;          // [N, B, 3]
     bool* touched;       // [N] sum w > 0 in some view
-    float* view_losses;  // [K, N] or [1, N]
 };
 
 // One optimizer step, fused with the backward pass of the projection; turbogs_plugin/engine/reference/update.py
 // defines it.
 struct OptimizerParams {
     UpdateKind kind;
-    bool rows_per_view;                       // LM: a row of J for each view, or one of their sum
-    float rates[ParameterRow::kSize];         // learning rates in the order of a row
-    float inverse_rates[ParameterRow::kSize];  // at most 2^63: the damping of a rate of zero
+    float rates[ParameterRow::kSize];  // learning rates in the order of a row
     float rate_shN;
     float beta1, beta2;
     float one_minus_beta1, one_minus_beta2;  // rounded once: the difference of the floats is off by 1.3e-5 at 0.999
     float log_beta1, log_beta2;              // natural logarithms, rounded once from double; -infinity where beta is 0
     float eps;
-    float curvature;  // balanced LM
-    float max_step;   // balanced LM, 0 for no bound
 
     // Where the new parameters go besides, maybe in other GPUs' memory: bytes behind each of them.
     int64_t copies[kMaxPeers - 1];

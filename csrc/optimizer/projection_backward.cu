@@ -17,26 +17,23 @@ struct RowWriter {
     int degree, num_gaussians, gaussian;
     float* harmonics;
     float sum[ParameterRow::kSize] = {};  // unless kPerView
-    float loss_sum = 0.0f;
 
     __device__ void add(int view, const ViewCamera& camera, const float row[ParameterRow::kSize],
-                        const float grad_color[3], float loss) {
+                        const float grad_color[3]) {
         add_harmonics_gradient(mean, camera, degree, grad_color, harmonics);
         if (kPerView) {
-            write(view, row, loss);
+            write(view, row);
         } else {
 #pragma unroll
             for (int i = 0; i < ParameterRow::kSize; ++i) sum[i] += row[i];
-            loss_sum += loss;
         }
     }
 
-    __device__ void write(int view, const float row[ParameterRow::kSize], float loss) const {
+    __device__ void write(int view, const float row[ParameterRow::kSize]) const {
         const size_t place = static_cast<size_t>(view) * num_gaussians + gaussian;
         float2* out = outputs.rows + place * (ParameterRow::kSize / 2);
 #pragma unroll
         for (int i = 0; i < ParameterRow::kSize / 2; ++i) out[i] = make_float2(row[2 * i], row[2 * i + 1]);
-        outputs.view_losses[place] = loss;
     }
 };
 
@@ -95,11 +92,11 @@ __global__ void __launch_bounds__(kBackwardThreads) projection_backward_kernel(
             for (int first = 0; first < params.num_views; first += kViewGroup) {
                 const uint32_t mask = views_of(first);
                 for (int view = first; view < min(params.num_views, first + kViewGroup); ++view) {
-                    if ((mask >> (view - first) & 1u) == 0u) writer.write(view, zeros, 0.0f);
+                    if ((mask >> (view - first) & 1u) == 0u) writer.write(view, zeros);
                 }
             }
         } else {
-            writer.write(0, writer.sum, writer.loss_sum);
+            writer.write(0, writer.sum);
         }
         if (params.view_counts != nullptr) add_sight(params, gaussian, sight_of(params, gaussian));
         outputs.touched[gaussian] = touched;

@@ -31,19 +31,19 @@ from turbogs_plugin.report.provenance import hardware  # noqa: E402
 from turbogs_plugin.report.tables import table  # noqa: E402
 
 CPU = torch.device("cpu")
-Problem = tuple[Tensor, Tensor, Tensor, Tensor]
-"""rows [K, n, D], weights [K, n], damping [n, D], rhs [n, D], as the solvers take them."""
+Problem = tuple[Tensor, Tensor, Tensor]
+"""rows [K, n, D], damping [n, D], rhs [n, D], as the solvers take them."""
 
 
-def solve_raw_cholesky(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
+def solve_raw_cholesky(rows: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
     """Cholesky of the system as printed in the paper, unscaled; NaN if a pivot fails or products overflow."""
-    matrix = torch.einsum("kn,kni,knj->nij", weights, rows, rows) + torch.diag_embed(damping)
+    matrix = torch.einsum("kni,knj->nij", rows, rows) + torch.diag_embed(damping)
     factor, failed = torch.linalg.cholesky_ex(matrix)
     solution = torch.cholesky_solve(rhs.unsqueeze(-1), factor).squeeze(-1)
     return torch.where((failed == 0).unsqueeze(-1), solution, torch.nan)
 
 
-SOLVERS: dict[str, Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]] = {
+SOLVERS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
     "raw Cholesky, float32": solve_raw_cholesky,
     "scaled Cholesky, float32": lm_solvers.solve_scaled_cholesky,
     "low rank, float32": lm_solvers.solve_low_rank,
@@ -69,9 +69,9 @@ class Stiffness:
 
     Args:
         name: for tables.
-        length: of the scaled rows sqrt(c_k) g_k / sqrt(d): 1 + K length^2 is the condition number after scaling.
+        length: of the scaled rows g_k / sqrt(d): 1 + K length^2 is the condition number after scaling.
         decades: range of the damping within a block: the condition number before scaling.
-        size: of the loss, and with it of gradients, damping and right side.
+        size: of damping and right side; rows have its root.
         parallel: whether the rows of a system are one row, K times.
     """
 
@@ -103,17 +103,16 @@ def make_problem(family: Stiffness, views: int, count: int, seed: int) -> Proble
     directions = normal(1, count, SIZE).expand(views, -1, -1) if family.parallel else normal(views, count, SIZE)
     rows = family.length * directions / directions.norm(dim=-1, keepdim=True) * damping.sqrt()
     rhs = normal(count, SIZE) * damping.sqrt()
-    weights = torch.full((views, count), 1 / family.size, dtype=torch.float64)
-    return (rows * family.size).float(), weights.float(), (damping * family.size).float(), (rhs * family.size).float()
+    return (rows * family.size**0.5).float(), (damping * family.size).float(), (rhs * family.size).float()
 
 
 def scaled_errors(solution: Tensor, exact: np.ndarray, problem: Problem) -> np.ndarray:
     """[n] distance of each solution from the exact one, over the length of the step without rows; inf where the
     solution is not finite."""
-    root = problem[2].double().numpy() ** 0.5
+    root = problem[1].double().numpy() ** 0.5
     with np.errstate(invalid="ignore"):
         distance = np.linalg.norm(solution.double().numpy() * root - exact.astype(np.float64), axis=-1)
-    step = np.linalg.norm(problem[3].double().numpy() / root, axis=-1)
+    step = np.linalg.norm(problem[2].double().numpy() / root, axis=-1)
     return np.where(np.isfinite(distance), distance / step, np.inf)
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
 from turbogs_plugin.engine.reference.update import apply_update
-from turbogs_plugin.engine.rules import MomentLMParams, UpdateRule
+from turbogs_plugin.engine.rules import UpdateRule
 from turbogs_plugin.errors import require
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.learning_rates import LearningRates
@@ -23,7 +23,7 @@ class SparseAdam:
     A Gaussian that no sample touched keeps its parameters, moments and step count, so momentum does not move it. A
     Gaussian with a non-finite gradient is left alone too, and counted.
 
-    An optimizer with another `rule` on the same moments inherits from this one, as `MomentLMOptimizer` does.
+    An optimizer of another `kind` on the same moments inherits from this one, as `MomentLMOptimizer` does.
 
     Args:
         learning_rates: rate of each parameter over the run.
@@ -44,13 +44,13 @@ class SparseAdam:
         require_settings(self)
 
     @property
-    def per_view(self) -> bool:
-        return False
+    def kind(self) -> str:
+        """The kind of the rule, one of `layout.UPDATE_KINDS`."""
+        return "adam"
 
     @property
-    def lm(self) -> MomentLMParams | None:
-        """The damped system of the rule, or None for Adam's step."""
-        return None
+    def per_view(self) -> bool:
+        return self.kind != "adam"
 
     @property
     def skipped(self) -> Tensor:
@@ -62,7 +62,7 @@ class SparseAdam:
 
     def rule(self, step: Step) -> UpdateRule:
         """The rule of this iteration's step."""
-        return UpdateRule(self.learning_rates.at(step), self.beta1, self.beta2, self.eps, self.lm)
+        return UpdateRule(self.learning_rates.at(step), self.beta1, self.beta2, self.eps, self.kind)
 
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
         require("moments" in vars(self), "optimizer", type(self).__name__, "set up, by setup(gaussians) before step")

@@ -38,7 +38,7 @@ CASES = {
     "one tile": ("schedule.type=fixed", "schedule.views=1", "schedule.pixel_budget=0.1", "pixel_sampler.unit=tile"),
     "tiles": ("pixel_sampler.unit=tile",),
     "weights": ("pixel_sampler.importance=0.5",),
-    "summed rows": ("optimizer.rows=summed",),
+    "rows of each view": ("optimizer.type=moment_lm",),
     "no rule": ("optimizer.type=adam",),
     "exposures": ("train.exposure=true", "train.background=random", "train.average_last=1.0"),
     "dropout": ("train.dropout=0.3",),

@@ -145,8 +145,8 @@ def test_the_kernels_have_the_sizes_and_enumerations_of_python(headers):
     for name, values in (("SampleUnit", layout.SAMPLE_UNITS), ("Structure", layout.STRUCTURES)):
         entries = re.search(rf"enum class {name} : int {{(.*?)}}", text)[1].split(",")
         assert [entry.strip().removeprefix("k").lower() for entry in entries] == [v.replace("_", "") for v in values]
-    assert "enum class UpdateKind : int { kAdam, kBalancedLm, kPaperLm };" in text
-    assert layout.UPDATE_KINDS == ("adam", "balanced_lm", "paper_lm")
+    assert "enum class UpdateKind : int { kAdam, kMomentLm, kUnscaledLm };" in text
+    assert layout.UPDATE_KINDS == ("adam", "moment_lm", "unscaled_lm")
 
 
 def test_rows_of_views_are_what_the_layout_says():

@@ -125,7 +125,6 @@ def test_values_and_gradients_are_those_of_gsplats_torch_code_and_rows_sum_to_th
         if name != "shN":
             assert getattr(by_view, name).shape == (2, *expected.shape)
             assert getattr(total, name).shape == (1, *expected.shape)
-    torch.testing.assert_close(by_view.view_losses.sum(dim=0), total.view_losses[0])
 
 
 def test_each_view_row_is_the_gradient_of_that_view_alone():
@@ -139,8 +138,6 @@ def test_each_view_row_is_the_gradient_of_that_view_alone():
         expected = alone.backward(colors[mine], errors[mine]).parameter_gradients(rows=True)
         for name in PARAMETER_NAMES[:-1]:
             torch.testing.assert_close(getattr(rows, name)[view], getattr(expected, name)[0])
-        share = mine.double().mean()
-        torch.testing.assert_close(rows.view_losses[view], expected.view_losses[0] * share)
 
 
 def test_absolute_gradients_and_squares_are_those_of_single_pixels():
@@ -189,7 +186,6 @@ def test_statistics_are_added_once_as_documented():
     largest = (radii.amax(dim=-1) / torch.tensor([[37.0], [50.0]])).amax(dim=0)
     torch.testing.assert_close(stats.max_radii, largest.clamp(min=1))
     assert torch.equal(gradients.touched, record[..., ScreenRecord.WEIGHT_SUM].sum(dim=0) > 0)
-    torch.testing.assert_close(gradients.view_losses, record[..., ScreenRecord.ERROR_SUM] / len(samples))
 
 
 @pytest.mark.parametrize("origin", [(1, 0), (15, 15), (6, 11)])
@@ -204,7 +200,7 @@ def test_where_the_grid_of_tiles_begins_does_not_matter(origin):
         rendered = rasterize(gaussians, cameras, samples, with_depth=True)
         gradients = rendered.backward(colors, errors).parameter_gradients(rows=False)
         images = [value[pixels.argsort()] for value in (rendered.colors, rendered.alphas, rendered.depths)]
-        found.append([*images, *(gradients.summed(name) for name in PARAMETER_NAMES), gradients.view_losses])
+        found.append([*images, *(gradients.summed(name) for name in PARAMETER_NAMES)])
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(other, one, rtol=1e-9, atol=1e-12)
 
@@ -283,18 +279,6 @@ def test_settings_are_used():
 def test_settings_out_of_bounds_are_refused(values):
     with pytest.raises(InputError, match=f"{list(values)[-1]} = "):
         RasterSettings(**values)
-
-
-def test_shares_of_the_loss_are_of_the_filled_slots():
-    gaussians, cameras = make_gaussians(40), make_cameras(SIZES)
-    shares = []
-    for empty in (0, 5):
-        samples = thin_out(dense_samples(cameras), 0.3, empty_slots=empty)
-        colors = torch.ones(len(samples), 3, dtype=torch.float64)
-        screen = rasterize(gaussians, cameras, samples).backward(colors, colors[:, 0])
-        shares.append(screen.parameter_gradients(rows=True).view_losses)
-    torch.testing.assert_close(*shares)
-    assert shares[0].any()
 
 
 def test_other_cameras_and_gradients_that_are_wanted_are_refused_by_name():

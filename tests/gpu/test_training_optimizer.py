@@ -41,10 +41,7 @@ RATES = LearningRates(scales=0.1, quats=0.05, opacities=0.2, sh0=0.1, shN=0.05)
 OPTIMIZERS = {
     "adam": SparseAdam(RATES),
     "lm": MomentLMOptimizer(RATES),
-    "lm unbound": MomentLMOptimizer(RATES, max_step=0.0, curvature=1.0),
-    "lm summed": MomentLMOptimizer(RATES, rows="summed"),
-    "paper": MomentLMOptimizer(RATES, units="paper", eps=1e-8),
-    "paper summed": MomentLMOptimizer(RATES, units="paper", rows="summed", eps=1e-8),
+    "unscaled lm": MomentLMOptimizer(RATES, scaled=False, eps=1e-8),
     "no momentum": MomentLMOptimizer(RATES, beta1=0.0, beta2=0.0),
 }
 
@@ -135,7 +132,7 @@ def test_gradients_are_the_reference_s(degree, used_degree, rows):
     expected_stats, stats = GaussianStats.zeros(count, "cpu"), GaussianStats.zeros(count, DEVICE)
     expected = scene.reference().parameter_gradients(rows, expected_stats)
     found = scene.screen().parameter_gradients(rows, stats)
-    for name in (*PARAMETER_NAMES, "view_losses"):
+    for name in PARAMETER_NAMES:
         value, wanted = getattr(found, name), getattr(expected, name)
         assert value.shape == wanted.shape, name
         if wanted.numel():
@@ -153,8 +150,7 @@ def test_gradients_are_the_reference_s(degree, used_degree, rows):
 
 def twin_step(optimizer, gaussians, scene):
     """The torch twin's step in float64, from the kernels' own gradients."""
-    rows = getattr(optimizer, "rows", "summed") == "views"
-    gradients = scene.screen().parameter_gradients(rows)
+    gradients = scene.screen().parameter_gradients(optimizer.per_view)
     values = {field.name: doubled(getattr(gradients, field.name)) for field in fields(GaussianGradients)}
     optimizer.step(gaussians, GaussianGradients(**values), STEP)
 
@@ -167,7 +163,7 @@ def test_fused_step_is_the_twin_s(name, degree):
 
 @pytest.mark.parametrize(
     ("name", "views"),
-    [("lm", 1), ("lm", 9), ("paper", 9), ("lm", 40), ("adam", 40), ("adam", 128), ("lm summed", 128)],
+    [("lm", 1), ("lm", 9), ("unscaled lm", 9), ("lm", 40), ("adam", 40), ("adam", 128), ("lm", 128)],
 )
 def test_fused_step_of_few_and_of_many_views(name, views):
     """More rows than a Gaussian has room for in shared memory, and more views than a mask has bits."""
@@ -239,10 +235,9 @@ def test_a_step_changes_copies_alike(degree):
         _ = ModelCopies(own, [others[0].map(torch.clone)]).distances
 
 
-def test_rows_of_vanishing_loss_are_cut():
-    """Shares of the loss down to denormals: the scaled rows would overflow without their limit."""
-    scene, optimizer = Scene(), OPTIMIZERS["lm unbound"]
-    scene.records[..., ScreenRecord.ERROR_SUM] *= 1e-33
+def test_long_rows_are_cut():
+    """Gradients of 1e8: scaled rows of about 1e4 lose the damping beside them without their limit."""
+    scene, optimizer = Scene(size=1e3), OPTIMIZERS["lm"]
     expected = scene.gaussians.map(doubled)
     optimizer.setup(expected)
     twin_step(optimizer, expected, scene)
@@ -255,7 +250,7 @@ def test_rows_of_vanishing_loss_are_cut():
         assert float((end - wanted).norm()) <= 2e-3 * float((wanted - start).norm()), parameter
 
 
-@pytest.mark.parametrize("name", ["adam", "lm", "paper summed"])
+@pytest.mark.parametrize("name", ["adam", "lm"])
 @pytest.mark.parametrize("entry", [0, 3, 5, 8])
 def test_bad_gradient_is_skipped_and_neighbours_step(name, entry):
     optimizer, bad = OPTIMIZERS[name], 17

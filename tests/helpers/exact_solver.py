@@ -4,15 +4,15 @@ import numpy as np
 from torch import Tensor
 
 
-def solve_exactly(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> np.ndarray:
+def solve_exactly(rows: Tensor, damping: Tensor, rhs: Tensor) -> np.ndarray:
     """[n, D] longdouble: the scaled unknown sqrt(d) x, by Gauss-Jordan elimination, every row at its full length.
 
     Args:
-        rows, weights, damping, rhs: [K, n, D], [K, n], [n, D], [n, D], as the solvers take them.
+        rows, damping, rhs: [K, n, D], [n, D], [n, D], as the solvers take them.
     """
-    rows, weights, damping, rhs = (v.double().numpy().astype(np.longdouble) for v in (rows, weights, damping, rhs))
+    rows, damping, rhs = (v.double().numpy().astype(np.longdouble) for v in (rows, damping, rhs))
     scale, size = 1 / np.sqrt(damping), damping.shape[1]
-    scaled = rows * scale * np.sqrt(weights)[..., None]
+    scaled = rows * scale
     identity = np.broadcast_to(np.eye(size, dtype=np.longdouble), (len(rhs), size, size))
     augmented = np.concatenate([identity + np.einsum("kni,knj->nij", scaled, scaled), (rhs * scale)[..., None]], axis=2)
     for column in range(size):  # no pivoting: the matrix is positive definite

@@ -33,7 +33,7 @@ def ready(optimizer, gaussians: Gaussians):
 
 
 def make_gradients(views: int, count: int, seed: int = 1, dtype=torch.float64, size: float = 1e-5) -> GaussianGradients:
-    """Random gradients of about `size` in every view, all Gaussians touched, loss shares of about `size`."""
+    """Random gradients of about `size` in every view, all Gaussians touched."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -47,14 +47,7 @@ def make_gradients(views: int, count: int, seed: int = 1, dtype=torch.float64, s
         sh0=normal(views, count, 1, 3),
         shN=normal(count, 3, 3),
         touched=torch.ones(count, dtype=torch.bool),
-        view_losses=normal(views, count).abs() * 0.1,
     )
-
-
-def scaled(gradients: GaussianGradients, factor: float) -> GaussianGradients:
-    """The gradients of a loss that is `factor` times as large."""
-    values = {field.name: getattr(gradients, field.name) for field in fields(GaussianGradients)}
-    return GaussianGradients(**{name: v if name == "touched" else v * factor for name, v in values.items()})
 
 
 def random_stats(count: int, seed: int, seen: float = 0.8) -> GaussianStats:

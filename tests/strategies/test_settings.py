@@ -23,7 +23,7 @@ REFUSED = {
     "SparseSsimLoss": ({"ssim_weight": 1.1},),
     "LearningRates": ({"shN": math.nan}, {"means": 0.0}, {"batch_scale": math.inf}),
     "SparseAdam": ({"beta1": 1.0}, {"beta2": -0.1}, {"eps": 0.0}),
-    "MomentLMOptimizer": ({"units": "metres"}, {"rows": "x"}, {"curvature": -1.0}),
+    "MomentLMOptimizer": ({"beta1": 1.0},),
     "DenseAdam": ({"opacity_reg": -1.0}, {"scale_reg": math.nan}),
     "ErrorDrivenDensity": ({"score": "best"}, {"refine_every": 0}, {"top_fraction": 0.0}, {"max_gaussians": -1}),
     "GsplatDefaultDensity": ({"opacity_reset": "never"}, {"refine_every": 0}, {"refine_start_iter": -1}),

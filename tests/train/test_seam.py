@@ -83,7 +83,7 @@ def test_an_optimizer_of_its_own_code_trains_as_its_rule_would(capture, make):
         trainer.optimizer = optimizer
         optimizer.setup(trainer.gaussians)
     assert_equal(run(ruled), run(coded))
-    rows = {len(gradients.view_losses) for gradients in coded.optimizer.seen}
+    rows = {len(gradients.means) for gradients in coded.optimizer.seen}
     assert rows == {1} if make is SparseAdam else max(rows) > 1
 
 

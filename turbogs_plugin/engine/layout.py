@@ -35,7 +35,7 @@ STRUCTURES = ("none", "ncc", "ssim", "printed_ncc")
 WINDOW_RADIUS = 5
 """Pixels from the middle of a window of SSIM to its edge, along each axis."""
 
-UPDATE_KINDS = ("adam", "balanced_lm", "paper_lm")
+UPDATE_KINDS = ("adam", "moment_lm", "unscaled_lm")
 """Kinds of a step of the parameters. The kernels number them in this order."""
 
 MAX_PEERS = 8

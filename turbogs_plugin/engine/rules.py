@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 from turbogs_plugin.types import TILE_SIZE
 
@@ -133,35 +132,24 @@ class ParameterRates:
 
 
 @dataclass(frozen=True)
-class MomentLMParams:
-    """Settings of moment-damped LM beyond Adam; see `MomentLMOptimizer` for the meaning of each."""
-
-    units: Literal["balanced", "paper"]
-    rows: Literal["views", "summed"]
-    curvature: float
-    max_step: float
-
-
-@dataclass(frozen=True)
 class UpdateRule:
     """One step of the parameters (paper section 3.9); `engine.reference.update` defines it.
-
-    It is Adam; or, with `lm`, moment-damped LM on two blocks of each Gaussian and Adam on the higher bands.
 
     Args:
         rates: learning rate of each parameter at this iteration.
         beta1, beta2: decay of the moments.
-        eps: added to sqrt(v), after the bias correction of v.
-        lm: None for Adam.
+        eps: added to sqrt(v); Adam's v is bias-corrected before.
+        kind: one of `layout.UPDATE_KINDS`. `moment_lm` is moment-damped LM times the rates on two blocks of each
+            Gaussian, and Adam on the higher bands; `unscaled_lm` is the same without the rates.
     """
 
     rates: ParameterRates
     beta1: float
     beta2: float
     eps: float
-    lm: MomentLMParams | None = None
+    kind: str = "adam"
 
     @property
     def per_view(self) -> bool:
         """Whether the rule needs the gradients of each view; else their sum suffices."""
-        return self.lm is not None and self.lm.rows == "views"
+        return self.kind != "adam"

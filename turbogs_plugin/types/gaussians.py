@@ -73,12 +73,9 @@ class GaussianGradients(ParameterTensors):
         means, quats, scales, opacities, sh0: [K, N, ...] one row per view, or [1, N, ...] the sum of these.
         shN: [N, B, 3], always summed.
         touched: [N] bool, the Gaussian contributed to some sampled pixel.
-        view_losses: [K, N] (or [1, N]), the Gaussian's share of the loss in each view, ``sum over pixels of
-            e * w / P``; zero where the Gaussian contributed nothing.
     """
 
     touched: Tensor
-    view_losses: Tensor
 
     def summed(self, name: str) -> Tensor:
         """The gradient of one parameter in its own shape, summed over views."""
@@ -87,7 +84,7 @@ class GaussianGradients(ParameterTensors):
 
     def over_views(self) -> GaussianGradients:
         """The gradients with one row, the sum over views; itself if it has one row already."""
-        if len(self.view_losses) == 1:
+        if len(self.means) == 1:
             return self
         sums = {name: value.sum(dim=0, keepdim=True) for name, value in vars(self).items()}
         return replace(self, **(sums | {"shN": self.shN, "touched": self.touched}))

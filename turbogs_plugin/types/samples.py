@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -80,9 +80,6 @@ class PixelSamples:
         host_ends: gives ([K], [T]) int64 numpy arrays, the end of each view's tiles (in `tile_ids`) and of each tile's
             slots, where the host knows them without asking the device; None: it has to ask.
         origin: of the grid of tiles, see `TileGrid`.
-
-    Attributes:
-        num_filled: [1] int32, kept by whoever counted the filled slots.
     """
 
     view_ids: tuple[int, ...]
@@ -94,7 +91,6 @@ class PixelSamples:
     has_empty_slots: bool = True
     host_ends: Callable[[], tuple[np.ndarray, np.ndarray]] | None = None
     origin: tuple[int, int] = (0, 0)
-    num_filled: Tensor | None = field(init=False, default=None, repr=False, compare=False)
 
     @classmethod
     def from_mask(cls, mask: Tensor, view_ids: Sequence[int] | None = None) -> PixelSamples:

@@ -60,7 +60,7 @@ class CudaEngine(SharedEngine):
         plain: ScreenRecords,
     ) -> CudaScreenGradients:
         scene = scene_of(ready(gaussians), cameras, options)
-        return CudaScreenGradients(scene, samples, plain.records, plain.radii, self.overflow)
+        return CudaScreenGradients(scene, plain.records, plain.radii, self.overflow)
 
     def collect(self, sources: Sequence[ScreenRecords], views: Sequence[int], target: ScreenRecords, row: int) -> None:
         arrays = [array for source in sources for array in (source.records, source.radii)]

@@ -61,14 +61,12 @@ class CudaScreenGradients(ScreenGradients):
 
     Args:
         scene: what was drawn. Its Gaussians are raw parameters, the caller's own tensors if those were contiguous.
-        samples: the pass's samples.
         records: [K, N, 16] float32, `layout.ScreenRecord`. Where a Gaussian is off screen, a record may hold anything.
         radii: [K, N, 2] int32, zero where off screen.
         overflow: [1] int32 on the device, or None; if not 0, the pass drew nothing and nothing may change.
     """
 
     scene: launches.Scene
-    samples: PixelSamples
     records: Tensor
     radii: Tensor
     overflow: Tensor | None = None
@@ -82,15 +80,15 @@ class CudaScreenGradients(ScreenGradients):
         shape = (len(self.records) if rows else 1, len(gaussians))
         # The kernel writes every entry, unless an overflow keeps it from running.
         new = partial(torch.empty if self.overflow is None else torch.zeros, device=self.records.device)
-        packed, shN, view_losses = new(*shape, ParameterRow.SIZE), new(gaussians.shN.shape), new(*shape)
+        packed, shN = new(*shape, ParameterRow.SIZE), new(gaussians.shN.shape)
         touched = new(len(gaussians), dtype=torch.bool)
         screen = self.backward_arguments(stats)
-        library.launch(launches.ProjectionBackward(screen, packed, shN, touched, view_losses))
+        library.launch(launches.ProjectionBackward(screen, packed, shN, touched))
         columns = {
             name: packed[..., place].view(*shape, *getattr(gaussians, name).shape[1:])
             for name, place in COLUMNS.items()
         }
-        return GaussianGradients(**columns, shN=shN, touched=touched, view_losses=view_losses)
+        return GaussianGradients(**columns, shN=shN, touched=touched)
 
     def backward_arguments(self, stats: GaussianStats | None) -> launches.ScreenBackward:
         """The arguments shared by the launches that take these gradients to the parameters."""
@@ -99,19 +97,15 @@ class CudaScreenGradients(ScreenGradients):
             records=self.records,
             radii=self.radii,
             stats=launches.NO_STATS if stats is None else stats,
-            num_filled=count_filled(self.samples),
-            num_slots=len(self.samples),
             overflow=self.overflow,
         )
 
 
 def count_filled(samples: PixelSamples) -> Tensor | None:
-    """[1] int32 on the device: the number of filled slots; None if all are. Counted once for the loss and the step."""
+    """[1] int32 on the device: the number of filled slots; None if all are."""
     if not samples.has_empty_slots:
         return None
-    if samples.num_filled is None:
-        samples.num_filled = (samples.pixel_ids >= 0).sum(dtype=torch.int32).reshape(1)
-    return samples.num_filled
+    return (samples.pixel_ids >= 0).sum(dtype=torch.int32).reshape(1)
 
 
 @dataclass
@@ -120,7 +114,6 @@ class CudaRendered(Rendered):
 
     _status: Tensor = field(repr=False)  # [2] int32, of `layout.PassStatus`
     _scene: launches.Scene = field(repr=False)
-    _samples: PixelSamples = field(repr=False)
     _workspace: Workspace | None = field(repr=False)
     _radii: Tensor = field(repr=False)  # [K, N, 2]
     _forward: launches.RasterForward = field(repr=False)
@@ -152,7 +145,7 @@ class CudaRendered(Rendered):
         self._cleared = False
         overflow = None if self._workspace is None else self._workspace.overflow
         records = records.view(*self._radii.shape[:2], ScreenRecord.SIZE)
-        return CudaScreenGradients(self._scene, self._samples, records, self._radii, overflow)
+        return CudaScreenGradients(self._scene, records, self._radii, overflow)
 
 
 def scene_of(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> launches.Scene:
@@ -299,7 +292,6 @@ def rasterize_cuda(
         forward.depths,
         _status=tiles.status,
         _scene=scene,
-        _samples=samples,
         _workspace=workspace,
         _radii=splats.radii,
         _forward=forward,

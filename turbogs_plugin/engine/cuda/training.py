@@ -217,20 +217,16 @@ def fused_step(
         value.data_ptr() != getattr(drawn, name).data_ptr() for name, value in gaussians.items()
     ):
         raise ValueError("fused_step: these are not the Gaussians that the gradients were made of")
-    lm = rule.lm
     library.launch(
         launches.FusedStep(
             screen=screen.backward_arguments(stats),
             copies=_copies(copies),
             moments=moments,
-            kind=UPDATE_KINDS.index("adam" if lm is None else f"{lm.units}_lm"),
-            rows_per_view=rule.per_view,
+            kind=UPDATE_KINDS.index(rule.kind),
             rates=rule.rates,
             beta1=rule.beta1,
             beta2=rule.beta2,
             eps=rule.eps,
-            curvature=0.0 if lm is None else lm.curvature,
-            max_step=0.0 if lm is None else lm.max_step,
         )
     )
 

@@ -1,8 +1,8 @@
-"""Small damped least-squares systems, many at once: ``(sum_k c_k g_k g_k^T + diag(d)) x = b``.
+"""Small damped least-squares systems, many at once: ``(sum_k g_k g_k^T + diag(d)) x = b``.
 
-All functions have one signature, ``solve(rows, weights, damping, rhs) -> x``:
+All functions have one signature, ``solve(rows, damping, rhs) -> x``:
 
-- rows: [K, n, D] the g_k; weights: [K, n] the c_k >= 0; damping: [n, D] the d > 0; rhs: [n, D] the b; x: [n, D].
+- rows: [K, n, D] the g_k; damping: [n, D] the d > 0; rhs: [n, D] the b; x: [n, D].
 
 For the blocks of Moment-LM (D = 10 and 4) `reference/update.py` uses `solve_low_rank`, and the CUDA kernel
 (`csrc/optimizer/moment_lm.cuh`) does what `solve_scaled_cholesky` does. Both first scale the system by d^(-1/2) on both
@@ -22,29 +22,29 @@ thousandth, nearly nothing, while the condition number stays below 1 + K * 1e4, 
 that length span many directions and are almost linearly dependent, cutting them changes the answer (it damps less)."""
 
 
-def scaled_rows(rows: Tensor, weights: Tensor, damping: Tensor) -> Tensor:
-    """[K, n, D]: sqrt(c_k) g_k / sqrt(d), cut to length `ROW_LIMIT`. Finite input gives no overflow and no NaN: the
+def scaled_rows(rows: Tensor, damping: Tensor) -> Tensor:
+    """[K, n, D]: g_k / sqrt(d), cut to length `ROW_LIMIT`. Finite input gives no overflow and no NaN: the
     direction is divided by its largest entry before anything is squared."""
     direction = rows * torch.rsqrt(damping)
     largest = direction.abs().amax(dim=-1, keepdim=True)  # [K, n, 1]
     unit = direction / largest.clamp(min=torch.finfo(rows.dtype).tiny)  # entries within -1 .. 1
     unit_norm = unit.square().sum(dim=-1, keepdim=True).sqrt().clamp(min=torch.finfo(rows.dtype).tiny)
-    length = (largest * unit_norm * weights.sqrt().unsqueeze(-1)).clamp(max=ROW_LIMIT)  # an overflow ends at the limit
+    length = (largest * unit_norm).clamp(max=ROW_LIMIT)  # an overflow ends at the limit
     return unit * (length / unit_norm)
 
 
-def solve_scaled_cholesky(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
+def solve_scaled_cholesky(rows: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
     """Cholesky of the scaled system, D x D, as in the CUDA kernel."""
     scale = torch.rsqrt(damping)
-    scaled = scaled_rows(rows, weights, damping)
+    scaled = scaled_rows(rows, damping)
     matrix = torch.einsum("kni,knj->ijn", scaled, scaled)
     return scale * _solve_identity_plus(matrix, (rhs * scale).T).T
 
 
-def solve_low_rank(rows: Tensor, weights: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
+def solve_low_rank(rows: Tensor, damping: Tensor, rhs: Tensor) -> Tensor:
     """Woodbury's form, a K x K system: cheaper than D x D where there are fewer rows than parameters."""
     scale = torch.rsqrt(damping)
-    scaled = scaled_rows(rows, weights, damping)
+    scaled = scaled_rows(rows, damping)
     scaled_rhs = rhs * scale
     gram = torch.einsum("kni,lni->kln", scaled, scaled)
     projected = torch.einsum("kni,ni->kn", scaled, scaled_rhs)

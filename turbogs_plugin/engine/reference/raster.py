@@ -59,10 +59,9 @@ class ReferenceScreenGradients(ScreenGradients):
             for name, value in zip(PARAMETER_NAMES, gradients, strict=True)
         }
         weights = self._sum_over_views(records[:, ScreenRecord.WEIGHT_SUM])[0]
-        losses = place(records[:, ScreenRecord.ERROR_SUM] / self.samples.filled.sum().clamp(min=1))
         if stats is not None:
             self._add_statistics(stats)
-        return GaussianGradients(**named, touched=weights > 0, view_losses=losses)
+        return GaussianGradients(**named, touched=weights > 0)
 
     def _sum_over_views(self, values: Tensor) -> Tensor:
         """[R, ...] -> [1, N, ...]."""

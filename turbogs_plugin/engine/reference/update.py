@@ -14,7 +14,7 @@ from torch import Tensor
 from turbogs_plugin.engine.layout import ParameterRow
 from turbogs_plugin.engine.moments import COLUMNS, GaussianMoments
 from turbogs_plugin.engine.reference.lm_solvers import solve_low_rank
-from turbogs_plugin.engine.rules import MomentLMParams, ParameterRates, UpdateRule
+from turbogs_plugin.engine.rules import ParameterRates, UpdateRule
 from turbogs_plugin.types import GaussianGradients, Gaussians
 
 BLOCKS = (
@@ -46,20 +46,18 @@ def apply_update(
     steps = moments.steps[index]
     columns = [getattr(gradients, name)[:, index].unsqueeze(-1).flatten(2) for name in COLUMNS]
     rows = clipped(torch.cat(columns, dim=-1))  # [K, n, 14]
-    losses = gradients.view_losses[:, index]  # [K, n]
     gradient = rows.sum(dim=0).clamp(-SUM_LIMIT, SUM_LIMIT)
     terms = advance(moments.exp_avg, moments.exp_avg_sq, gradient, index, steps, rule)
-    if rule.lm is None:
-        delta = adam_step(packed_rates(rule.rates, gradient), *terms)
+    rates = packed_rates(rule.rates, gradient)
+    if rule.kind == "adam":
+        delta = adam_step(rates, *terms)
     else:
-        if not rule.per_view:
-            rows, losses = gradient[None], losses.sum(dim=0, keepdim=True)
-        if rule.lm.units == "balanced":
-            delta = balanced_delta(rows, losses, *terms, rule.rates, rule.lm)
-        else:
-            # The printed equation: the g_k are the rows of J, and m and v have no bias correction.
-            damping = torch.sqrt(moments.exp_avg_sq[index]) + rule.eps
-            delta = _solve(rows, torch.ones_like(losses), damping, moments.exp_avg[index])
+        # The printed equation: the g_k are the rows of J, and m and v have no bias correction.
+        damping, mean = torch.sqrt(moments.exp_avg_sq[index]) + rule.eps, moments.exp_avg[index]
+        solution = [solve_low_rank(rows[..., block], damping[:, block], mean[:, block]) for block in BLOCKS]
+        delta = -torch.cat(solution, dim=-1)
+        if rule.kind == "moment_lm":
+            delta *= rates
     gradient = clipped(gradients.shN[index].flatten(1))
     terms = advance(moments.exp_avg_shN, moments.exp_avg_sq_shN, gradient, index, steps, rule)
     changes = {name: delta[:, place] for name, place in COLUMNS.items()}
@@ -111,38 +109,3 @@ def advance(
 def adam_step(rates: Tensor | float, mean: Tensor, denominator: Tensor) -> Tensor:
     """[n, D] the change of the parameters by Adam, from the results of `advance`."""
     return -(rates * (mean / denominator))
-
-
-def balanced_delta(
-    rows: Tensor, losses: Tensor, mean: Tensor, denominator: Tensor, parameter_rates: ParameterRates, lm: MomentLMParams
-) -> Tensor:
-    """[n, 14] change of the parameters by the unit-consistent form.
-
-    Args:
-        rows: [K, n, 14] gradients of each view.
-        losses: [K, n] the Gaussian's share of the loss in each view. A row whose share is zero or not finite is left
-            out, as it says nothing about curvature.
-        mean, denominator: [n, 14], from `advance`.
-    """
-    rates = packed_rates(parameter_rates, rows)
-    adam = adam_step(rates, mean, denominator)
-    has_share = (losses > 0) & torch.isfinite(losses)
-    largest = torch.finfo(rows.dtype).max
-    weights = torch.where(has_share, (lm.curvature / losses).clamp(max=largest), 0.0).to(rows.dtype)
-    # A rate of zero fixes its parameter, even against coupling: its damping divides by the root of the smallest float.
-    damping = denominator / rates.clamp(min=torch.finfo(rows.dtype).tiny ** 0.5)
-    delta = _solve(rows, weights, damping, mean)
-    if lm.max_step > 0:
-        bound = torch.maximum(lm.max_step * rates, adam.abs())
-        delta = torch.maximum(torch.minimum(delta, bound), -bound)
-    # Without rows the solution is Adam's step; taking Adam's makes them equal to the last bit.
-    takes_solution = torch.zeros_like(delta, dtype=torch.bool)
-    for block in BLOCKS:
-        has_row = (rows[..., block] != 0).any(dim=-1) & (weights > 0)  # [K, n]
-        takes_solution[:, block] = has_row.any(dim=0)[:, None]
-    return torch.where(takes_solution & (rates > 0), delta, adam)
-
-
-def _solve(rows: Tensor, weights: Tensor, damping: Tensor, mean: Tensor) -> Tensor:
-    """[n, 14] minus the solution of the damped systems, the 10x10 block of geometry and the 4x4 one of appearance."""
-    return -torch.cat([solve_low_rank(rows[..., b], weights, damping[:, b], mean[:, b]) for b in BLOCKS], dim=-1)

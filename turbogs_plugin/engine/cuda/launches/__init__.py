@@ -114,8 +114,6 @@ class ScreenBackward:
     records: Tensor  # [K, N, 16] float32, layout.ScreenRecord; anything where off screen
     radii: Tensor  # [K, N, 2] int32
     stats: GaussianStats  # the launch adds to them
-    num_filled: Tensor | None  # [1] int32; None where all slots are filled
-    num_slots: int  # P
     overflow: Tensor | None  # [1] int32; if not 0, the launch does nothing
 
 
@@ -217,7 +215,6 @@ class ProjectionBackward(Launch):
     rows: Tensor  # [K or 1, N, 14] float32, layout.ParameterRow
     shN_gradients: Tensor  # [N, B, 3] float32
     touched: Tensor  # [N] bool
-    view_losses: Tensor  # [K or 1, N] float32
 
 
 @dataclass
@@ -229,13 +226,10 @@ class FusedStep(Launch):
     copies: Copies  # bytes from each parameter to a copy of it, maybe in another GPU's memory; 0: no copy
     moments: GaussianMoments
     kind: int  # of layout.UPDATE_KINDS
-    rows_per_view: bool
     rates: ParameterRates
     beta1: float
     beta2: float
     eps: float
-    curvature: float
-    max_step: float
 
 
 @dataclass
