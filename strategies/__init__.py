@@ -1,14 +1,61 @@
 """The interchangeable parts of TurboGS: samplers, schedules, losses, density control and optimizers.
 
-Every protocol and every strategy can be imported from here; each is loaded when it is first used::
+Every protocol, every strategy and the data that their methods take can be imported from here; each is loaded when it
+is first used::
 
-    from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
-    from turbogs_plugin.strategies.protocols import PixelSampler
+    from turbogs_plugin.strategies import ErrorGuidedPixelSampler, ErrorMaps, PixelSampler, PixelSamples, Step
 """
 
+# ruff: noqa: F401
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from turbogs_plugin import lazy_face
+
+if TYPE_CHECKING:  # what editors and type checkers see
+    from turbogs_plugin.engine.rules import LossTerms, UpdateRule
+    from turbogs_plugin.error_maps import ErrorMaps
+    from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
+    from turbogs_plugin.strategies.density.gsplat_default import GsplatDefaultDensity
+    from turbogs_plugin.strategies.density.mcmc import GsplatMcmcDensity
+    from turbogs_plugin.strategies.density.rows import NoDensity
+    from turbogs_plugin.strategies.learning_rates import LearningRates
+    from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
+    from turbogs_plugin.strategies.optimizers.dense_adam import DenseAdam
+    from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+    from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
+    from turbogs_plugin.strategies.pixel_sampling import (
+        DensePixelSampler,
+        ErrorGuidedPixelSampler,
+        RandomPixelSampler,
+    )
+    from turbogs_plugin.strategies.protocols import (
+        DensityController,
+        GaussianOptimizer,
+        PixelSampler,
+        SamplingSchedule,
+        SparseLoss,
+        ViewSampler,
+    )
+    from turbogs_plugin.strategies.schedule import (
+        ExponentialSchedule,
+        FixedSchedule,
+        LinearSchedule,
+        SinusoidalSchedule,
+    )
+    from turbogs_plugin.strategies.view_sampling import GeometryAwareViewSampler, RandomViewSampler
+    from turbogs_plugin.types import (
+        Cameras,
+        GaussianGradients,
+        Gaussians,
+        GaussianStats,
+        LossOutput,
+        PixelSamples,
+        RowUpdate,
+        SamplingBudget,
+        Step,
+    )
 
 PROTOCOLS = {
     "schedule": "SamplingSchedule",
@@ -59,6 +106,9 @@ section gets."""
 _OWNERS = [*(place for types in TYPES.values() for place in types.values()), "learning_rates:LearningRates"]
 _PLACES = {name: f"{__name__}.protocols" for name in PROTOCOLS.values()}
 _PLACES |= {name: f"{__name__}.{module}" for module, _, name in (place.partition(":") for place in _OWNERS)}
+_PLACES |= dict.fromkeys(("LossTerms", "UpdateRule"), "turbogs_plugin.engine.rules")
+_DATA = "Cameras GaussianGradients Gaussians GaussianStats LossOutput PixelSamples RowUpdate SamplingBudget Step"
+_PLACES |= dict.fromkeys(_DATA.split(), "turbogs_plugin.types") | {"ErrorMaps": "turbogs_plugin.error_maps"}
 
 __all__ = list(_PLACES)
-__getattr__ = lazy_face(__name__, _PLACES)
+__getattr__, __dir__ = lazy_face(__name__, _PLACES)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.moments import GaussianMoments
@@ -143,26 +144,31 @@ class GaussianOptimizer(Protocol):
     """Turns gradients into a step of the parameters, in place (section 3.9).
 
     An optimizer whose `rule` is None makes the step in its own code, and its `moments` are None. Any other has both,
-    and an engine makes the step together with the backward pass that gives the gradients.
+    and an engine makes the step together with the backward pass that gives the gradients. A class that inherits from
+    this one and keeps no state per Gaussian needs only `step`.
     """
 
     @property
     def moments(self) -> GaussianMoments | None:
         """The state that a rule's step changes."""
+        return None
 
     @property
     def per_view(self) -> bool:
         """True where `step` takes the gradients of each view, not only their sum."""
+        return False
 
     @property
     def skipped(self) -> Tensor:
         """[] int64 on the device: updates skipped so far because a gradient was not finite. Read at evaluations."""
+        return torch.zeros((), dtype=torch.int64)
 
     def setup(self, gaussians: Gaussians) -> None:
         """Allocate state for these Gaussians; called once before training, and after a resume."""
 
     def rule(self, step: Step) -> UpdateRule | None:
         """The step of this iteration as a rule, or None."""
+        return None
 
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
         """Update `gaussians` in place by gradients of each view or their sum."""
@@ -170,6 +176,8 @@ class GaussianOptimizer(Protocol):
     def apply(self, update: RowUpdate) -> None:
         """Apply a change of the set of Gaussians to the state, row by row."""
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def state_dict(self) -> dict[str, Any]:
+        return {}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Load what `state_dict` gave."""

@@ -205,13 +205,19 @@ def test_many_photos_are_a_capture_that_trains(example, tmp_path):
 
 
 def test_the_parts_that_the_page_prints_train(capture, tmp_path, monkeypatch):
-    """The parts of docs/drop-in.md ("Your strategies in our trainer") train; the loss's gradient is its value's."""
-    page = (EXAMPLES.parent / "docs" / "drop-in.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"^```python\n(# my_parts.py\n.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    """The parts of docs/python.md train, as objects and by name; the loss's gradient is its value's."""
+    page = (EXAMPLES.parent / "docs" / "python.md").read_text(encoding="utf-8")
+    first, code, second = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     (settings,) = re.findall(r"^```yaml\n([^`]*my_parts:Huber.*?)^```$", page, re.DOTALL | re.MULTILINE)
     (tmp_path / "my_parts.py").write_text(code)
     (tmp_path / "my.yaml").write_text(settings)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    names: dict = {}
+    short = '"train.device=cpu", "train.iterations=4", "train.refine_until=2"'
+    for block in (first, second):
+        exec(block.replace("demo/capture", str(capture)).replace('"train.iterations=200"', short), names)
+    assert (tmp_path / "model.ply").is_file() and names["result"].history[-1].iteration == 4
     config = load_config("my.yaml", ["train.iterations=6", "train.device=cpu", f"scene.path={capture}"])
     assert run.train(config, tmp_path / "run").history[-1].psnr > 10
     colors, targets = torch.rand(2, 9, 3, dtype=torch.float64)

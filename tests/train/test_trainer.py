@@ -4,6 +4,7 @@ import json
 import math
 import os
 import pty
+import re
 import shutil
 import signal
 import sys
@@ -29,6 +30,7 @@ from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.strategies.protocols import PixelSampler, SparseLoss
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
+from turbogs_plugin.train.fit import fit
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.train.metrics import evaluate
@@ -377,7 +379,20 @@ def test_a_folder_that_cannot_be_written_is_not_resumed(capture, tmp_path, monke
 
 def test_a_folder_is_read_as_the_section_scene_says(capture):
     short = ("train.iterations=2", "train.refine_until=1", "train.device=cpu")
-    models = [run.fit(given, *short, "scene.factor=2") for given in (str(capture), capture, load_scene(capture, 2))]
+    given = (str(capture), capture, load_scene(capture, 2))
+    models = [fit(scene, *short, "scene.factor=2").gaussians for scene in given]
     for model in models[:2]:
         assert_identical(dict(model.items()), dict(models[2].items()))
-    assert not torch.equal(run.fit(load_scene(capture), *short).sh0, models[0].sh0)
+    assert not torch.equal(fit(load_scene(capture), *short).gaussians.sh0, models[0].sh0)
+
+
+def test_fit_takes_a_mapping_and_a_callback_and_names_what_it_does_not_know(capture):
+    seen: list = []
+    settings = {"train": {"iterations": 2, "refine_until": 1, "device": "cpu"}}
+    result = fit(capture, config=settings, callback=seen.append)
+    assert seen == result.history and result.config.train.iterations == 2
+    assert re.fullmatch(r"Fit of Scene 'capture': 7 .* points: .* on cpu, \d+\.\d\d dB after \d\.\d s", repr(result))
+    with pytest.raises(InputError, match="unknown kind of strategy 'sampler': did you mean"):
+        fit(capture, sampler=None)
+    with pytest.raises(InputError, match="fit: object is no PixelSampler: it lacks sample"):
+        fit(capture, config=settings, pixel_sampler=object())

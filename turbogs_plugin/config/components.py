@@ -93,15 +93,21 @@ def build(kind: str, mapping: Any) -> Any:
     type_name = mapping.get("type", default_type(kind))
     found = strategy_class(kind, type_name)
     strategy: Any = build_dataclass(found, {key: value for key, value in mapping.items() if key != "type"}, kind)
+    return completed(kind, strategy, f"{kind}.type '{type_name}'")
+
+
+def completed(kind: str, strategy: Any, named: str) -> Any:
+    """The strategy, with the defaults of its kind's protocol where it has none of its own. Raises `InputError`, which
+    calls it `named`, where it lacks what the protocol has."""
     # Run-time state counts as present, and no value is read: reading may need `setup`.
-    present = {*dir(found), *(field.name for field in fields(strategy))}
+    present = {*dir(strategy), *(field.name for field in (fields(strategy) if is_dataclass(strategy) else ()))}
     protocol = getattr(protocols, PROTOCOLS[kind])
     members = {name: value for name, value in vars(protocol).items() if name[0] != "_" or name == "__call__"}
     absent = {name: value for name, value in members.items() if name not in present}
     missing = [name for name, value in absent.items() if callable(value) or isinstance(value, property)]
     if missing:
         remedy = f"inherit from turbogs_plugin.strategies.{PROTOCOLS[kind]} for the defaults, and write the rest"
-        raise InputError(f"{kind}.type '{type_name}' is no {PROTOCOLS[kind]}: it lacks {', '.join(missing)}; {remedy}")
+        raise InputError(f"{named} is no {PROTOCOLS[kind]}: it lacks {', '.join(missing)}; {remedy}")
     for attribute, default in absent.items():
         object.__setattr__(strategy, attribute, default)  # of a frozen dataclass, too
     return strategy

@@ -101,11 +101,16 @@ def config_names() -> list[str]:
     return packaged_names(PACKAGE)
 
 
-def load_config(name_or_file: str = DEFAULT_CONFIG, overrides: Sequence[str] = ()) -> Config:
-    """The configuration of a packaged name or a YAML file, with overrides ``section.key=value`` on top. Raises
-    `InputError` for an unknown name, an unreadable file, an unknown key or type (naming the nearest), a wrong type of a
-    value, or one out of range."""
-    return resolve(apply_overrides(_load_mapping(name_or_file), overrides))
+def load_config(source: str | Mapping[str, Any] = DEFAULT_CONFIG, overrides: Sequence[str] = ()) -> Config:
+    """The configuration of a packaged name, a YAML file or a mapping like that of a YAML, on top of the default where
+    it names no base; with overrides ``section.key=value`` on top. Raises `InputError` for an unknown name, an
+    unreadable file, an unknown key or type (naming the nearest), a wrong type of a value, or one out of range."""
+    if isinstance(source, Mapping):
+        own = dict(source)
+        mapping = _merge(_load_mapping(str(own.pop("base", DEFAULT_CONFIG))), own)
+    else:
+        mapping = _load_mapping(source)
+    return resolve(apply_overrides(mapping, overrides))
 
 
 def settings_text(config: Config) -> str:

@@ -24,4 +24,4 @@ __all__ = [
     "sparse_loss",
     "sparse_rasterization",
 ]
-__getattr__ = lazy_face(__name__, {"TurboStep": "turbogs_plugin.gsplat_bridge.turbo_step"})
+__getattr__, __dir__ = lazy_face(__name__, {"TurboStep": "turbogs_plugin.gsplat_bridge.turbo_step"})

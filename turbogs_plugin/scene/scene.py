@@ -72,7 +72,7 @@ class PosedImages:
         return self.masks.image(view_id).to(self.cameras.viewmats.device)
 
 
-@dataclass
+@dataclass(repr=False)
 class Scene:
     """A capture ready for training, in its normalised frame.
 
@@ -102,3 +102,8 @@ class Scene:
     reprojection_error: float | None = None
     doubt: str = ""
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        width, height = self.train.cameras.sizes[0]
+        views = f"{len(self.train)} + {len(self.test)} views of {width}x{height}"
+        return f"Scene '{self.name}': {views}, {len(self.points):,} points"

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import torch
 
-from turbogs_plugin.captures.bundle_adjustment import refine_cameras
 from turbogs_plugin.captures.load import holds_photos_alone
-from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, resolve
+from turbogs_plugin.config.configuration import Config, resolve
 from turbogs_plugin.device import free_bytes
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine.layout import MAX_VIEWS
@@ -32,7 +31,6 @@ from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.train.saved_model import require_model
 from turbogs_plugin.train.session import Report, RunSession, Watch
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import Gaussians
 
 IMPORTS, CAMERAS = "interpreter and imports", "cameras of photos alone"
 """Parts of the wall time before photos are decoded."""
@@ -72,31 +70,6 @@ def new_loop(
     config, seconds = fitted_to_time(config, scene, device, ranks, gains)
     trainer = Trainer(config, scene, device, ranks.engine(device), gains)
     return TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), seconds=seconds, ranks=ranks)
-
-
-def fit(scene: Scene | Path | str, *overrides: str, config: str = DEFAULT_CONFIG) -> Gaussians:
-    """Train in memory: nothing is written, and only a count of photos is shown while they are decoded.
-
-    Args:
-        scene: a loaded one, its photos in host memory; or the folder of a capture, which the section `scene` of the
-            configuration says how to read.
-        overrides: changes of the configuration, ``section.key=value``.
-        config: name of a packaged configuration, or a YAML file.
-
-    Returns:
-        The model, on the device of the training and in the scene's coordinates. Errors as of `train`.
-    """
-    settings = load_config(config, overrides)
-    device = resolve_device(settings.train.device)
-    if isinstance(scene, str | Path):
-        scene = open_scene(replace(settings.scene, path=str(scene)), settings.train.refine_cameras)
-    else:
-        scene = refine_cameras(scene, settings.train.refine_cameras)
-    plan = make_plan(settings, scene, device)
-    loop = new_loop(plan.apply(settings), scene, device, gains=plan.facts.gains)
-    loop.run()
-    loop.trainer.require_finite()
-    return loop.trainer.gaussians
 
 
 def train(

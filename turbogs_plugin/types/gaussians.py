@@ -26,7 +26,7 @@ class ParameterTensors:
     shN: Tensor
 
 
-@dataclass
+@dataclass(repr=False)
 class Gaussians(ParameterTensors):
     """The model, in gsplat's parameter layout. All tensors share one device and one dtype.
 
@@ -41,6 +41,9 @@ class Gaussians(ParameterTensors):
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    def __repr__(self) -> str:
+        return f"{len(self):,} Gaussians of SH degree {self.sh_degree} on {self.device}"
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
         """(name, tensor) of each parameter, in the order of `PARAMETER_NAMES`."""
