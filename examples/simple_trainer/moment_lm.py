@@ -1,7 +1,4 @@
-"""Moment-damped LM in gsplat's trainer, after `density.py` and `errors.py`: ``python moment_lm.py SIMPLE_TRAINER.py``.
-
-It needs the Gaussians' shares of the loss. The density strategy passes them on; without it, steps are Adam's.
-"""
+"""Moment-damped LM in gsplat's trainer: ``python moment_lm.py SIMPLE_TRAINER.py``."""
 
 from editing import command_line
 

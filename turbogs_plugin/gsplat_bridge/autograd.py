@@ -14,7 +14,7 @@ from turbogs_plugin.engine.render import rasterize
 from turbogs_plugin.engine.render_pass import Projected, Rendered
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge.gaussian_errors import residuals
-from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, LOSS_SHARES, PREDICTION, STATISTICS
+from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, PREDICTION, STATISTICS
 from turbogs_plugin.gsplat_bridge.sparse_pixels import gather_pixels
 from turbogs_plugin.types import PARAMETER_NAMES, Cameras, Gaussians, GaussianStats, PixelSamples
 
@@ -92,7 +92,7 @@ class _Pass(torch.autograd.Function):
         gradients = screen.parameter_gradients(rows=False, stats=stats)
         ctx.means2d.absgrad = records[..., ScreenRecord.ABSOLUTE].clone()
         if errors is not None:
-            info |= {STATISTICS: stats, LOSS_SHARES: gradients.view_losses[0]}
+            info[STATISTICS] = stats
         means2d = records[..., ScreenRecord.MEAN].clone()
         return None, None, None, means2d, *(gradients.summed(name) for name in PARAMETER_NAMES)
 

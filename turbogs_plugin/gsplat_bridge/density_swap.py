@@ -24,7 +24,7 @@ from turbogs_plugin.gsplat_bridge.host import (
     require_one_process,
     role_of,
 )
-from turbogs_plugin.gsplat_bridge.optimizer_swap import COUNT, MemberOptimizer
+from turbogs_plugin.gsplat_bridge.optimizer_swap import COUNT
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.rows import add_stats
@@ -91,15 +91,12 @@ class TurboDensityStrategy(DefaultStrategy):
     def step_pre_backward(
         self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any]
     ) -> None:
-        """To be called before ``loss.backward()``. Shows `info` to optimizers that want the errors, too."""
+        """To be called before ``loss.backward()``."""
         require_one_process("TurboDensityStrategy")
         require_keys(info, ("means2d",), "info", "pass what the rasterization returned")
         if not info["means2d"].requires_grad:
             raise InputError(WITHOUT_GRADIENT)
         super().step_pre_backward(params, optimizers, state, step, info)
-        for optimizer in optimizers.values():
-            if isinstance(optimizer, MemberOptimizer):
-                optimizer.observe(info)
 
     @torch.no_grad()
     def step_post_backward(

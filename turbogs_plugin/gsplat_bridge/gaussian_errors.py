@@ -20,18 +20,15 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, LOSS_SHARES, PREDICTION, STATISTICS, require_keys
+from turbogs_plugin.gsplat_bridge.host import GROUND_TRUTH, PREDICTION, STATISTICS, require_keys
 from turbogs_plugin.types import GaussianStats
 
 WITHOUT_GRADIENT = (
     "info['means2d'] takes no gradient, as from a render with with_ut or with_eval3d, or under no_grad: "
-    "TurboDensityStrategy and the errors for MomentLMOptimizer need it; render without these options, or keep gsplat's "
+    "TurboDensityStrategy needs it; render without these options, or keep gsplat's "
     "MCMCStrategy"
 )
 RENDERED = "pass what the rasterization returned"
-
-ERROR_SUMS = "error_sums"
-"""Key of `info` under which the sums of the zero channel, [N, 2], stay for whoever asks for them second."""
 
 
 def residuals(info: dict[str, Any]) -> Tensor | None:
@@ -68,22 +65,8 @@ def iteration_stats(info: dict[str, Any], count: int) -> tuple[GaussianStats, bo
     return stats, True
 
 
-def loss_shares(info: dict[str, Any], count: int) -> Tensor | None:
-    """[N] each Gaussian's share of the loss, sum of e * w over the number of pixels; None where `info` has no errors.
-
-    After backward, for renders of `sparse_rasterization`.
-    """
-    if info.get(LOSS_SHARES) is not None:
-        _require_count(len(info[LOSS_SHARES]), count)
-        return info[LOSS_SHARES]
-    sums = _error_sums(info, count)
-    return None if sums is None else sums[:, 0] / info[PREDICTION][..., 0].numel()
-
-
 def _error_sums(info: dict[str, Any], count: int) -> Tensor | None:
-    """[N, 2] sums of e * w and of w by the zero channel, kept in `info` for whoever asks next; None without errors."""
-    if ERROR_SUMS in info:
-        return info[ERROR_SUMS]
+    """[N, 2] sums of e * w and of w by the zero channel; None without errors."""
     errors = residuals(info)
     if errors is None:
         return None
@@ -95,10 +78,8 @@ def _error_sums(info: dict[str, Any], count: int) -> Tensor | None:
     ones = torch.ones_like(errors)
     sums = zero_channel_sums(info, torch.stack([errors, ones, torch.zeros_like(ones)], dim=-1))[..., :2]
     if info["gaussian_ids"] is None:
-        info[ERROR_SUMS] = sums.reshape(-1, count, 2).sum(dim=0)
-    else:
-        info[ERROR_SUMS] = sums.new_zeros(count, 2).index_add(0, info["gaussian_ids"].long(), sums)
-    return info[ERROR_SUMS]
+        return sums.reshape(-1, count, 2).sum(dim=0)
+    return sums.new_zeros(count, 2).index_add(0, info["gaussian_ids"].long(), sums)
 
 
 def rows_of(info: dict[str, Any]) -> int | None:
@@ -141,7 +122,7 @@ def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
 
 
 def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
-    """[C, N, D], or [nnz, D] where packed: sum over pixels of ``upstream * w`` of each Gaussian, by gsplat's rasterizer.
+    """[C, N, D], or [nnz, D] where packed: sum over pixels of ``upstream * w`` of each Gaussian, by gsplat's passes.
 
     Args:
         info: of a pass of gsplat's `rasterization`. upstream: [C, H, W, D].

@@ -18,9 +18,8 @@ Optimizers = Mapping[str, torch.optim.Optimizer]
 PREDICTION, GROUND_TRUTH = "prediction", "ground_truth"
 """Keys of `info` under which a host puts its render and the ground truth."""
 
-STATISTICS, LOSS_SHARES = "gaussian_stats", "loss_shares"
-"""Keys under which `sparse_rasterization` leaves the pass's `GaussianStats`, and [N] the Gaussians' shares of the loss,
-once backward has run."""
+STATISTICS = "gaussian_stats"
+"""Key under which `sparse_rasterization` leaves the pass's `GaussianStats`, once backward has run."""
 
 GEOMETRY = ("means", "quats", "scales", "opacities")
 

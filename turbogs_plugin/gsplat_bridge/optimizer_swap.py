@@ -20,7 +20,6 @@ from torch import Tensor
 
 from turbogs_plugin.engine.moments import GaussianMoments, check_moments_config
 from turbogs_plugin.errors import InputError, require
-from turbogs_plugin.gsplat_bridge.gaussian_errors import loss_shares
 from turbogs_plugin.gsplat_bridge.host import GEOMETRY, ROLES, host_gaussians, require_keys, require_one_process
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
@@ -51,9 +50,7 @@ class SharedOptimizer:
         self.optimizer = copy.copy(optimizer)
         self.members: dict[str, MemberOptimizer] = {}
         self._gradients: dict[str, Tensor | None] = {}
-        self._infos: list[dict[str, Any]] = []  # shown since the first gradient of this round
-        self._shown: list[dict[str, Any]] = []  # shown before it
-        self._made = self._dropped = self._without_shares = 0
+        self._made = self._dropped = 0
 
     def __call__(
         self,
@@ -73,13 +70,6 @@ class SharedOptimizer:
             raise InputError(f"there is a member for parameter '{member.name}' already: each name is given once")
         self.members[member.name] = member
         return member
-
-    def observe(self, info: dict[str, Any]) -> None:
-        """Show this iteration's `info`, before or after backward; of several renders, one after the other. From
-        "prediction" and "ground_truth" in it follow the Gaussians' shares of the loss, which the damped system needs;
-        without them the step is Adam's."""
-        if all(info is not other for other in self._infos):
-            self._infos.append(info)
 
     def hand_over(self, name: str, gradient: Tensor | None) -> None:
         """Take a member's gradient; the last one to come carries out the update of all parameters.
@@ -102,8 +92,6 @@ class SharedOptimizer:
                 print(f"SharedOptimizer: {said}. A GradScaler does that after an inf; else step all in each iteration.")
         if name in self._gradients:
             raise InputError(f"the optimizer of '{name}' was stepped twice: expected a step of {waiting} in between")
-        if not self._gradients:
-            self._shown, self._infos = self._infos, []
         self._gradients[name] = gradient
         if len(self._gradients) == len(self.members):
             self._update()
@@ -122,8 +110,7 @@ class SharedOptimizer:
         moments.steps.fill_(int(members["means"].checked_state()[COUNT]))
         for place, moment in self._moments(moments):
             place.copy_(moment.reshape(place.shape))
-        self.optimizer.step(gaussians, _one_row(gaussians, gradients, self._shares(gaussians)), Step(0, 1, 1))
-        self._shown = []
+        self.optimizer.step(gaussians, _one_row(gaussians, gradients), Step(0, 1, 1))
         for place, moment in self._moments(moments):
             moment.copy_(place.reshape(moment.shape))
         members["means"].checked_state()[COUNT] += 1
@@ -145,21 +132,6 @@ class SharedOptimizer:
         for name, member in self.members.items():
             state = member.checked_state()
             yield from ((packed.part(moment, name), state[moment]) for moment in MOMENTS)
-
-    def _shares(self, gaussians: Gaussians) -> Tensor:
-        """[1, N] the Gaussians' share of the loss, a mean over the renders; zero where nothing is known of it."""
-        known = [loss_shares(info, len(gaussians)) for info in self._shown]
-        shares = [value for value in known if value is not None]
-        if shares:
-            return torch.stack(shares).mean(dim=0, keepdim=True).to(gaussians.means.dtype)
-        self._without_shares += 1
-        if self._without_shares == 1 and self.optimizer.lm is not None:
-            print(
-                f"{type(self.optimizer).__name__}: the Gaussians' shares of the loss are not known, so steps are "
-                "Adam's; put prediction and ground_truth into info before loss.backward(), and call "
-                "optimizers['means'].observe(info) after it (TurboDensityStrategy does that)."
-            )
-        return gaussians.means.new_zeros(1, len(gaussians))
 
 
 class MemberOptimizer(torch.optim.Optimizer):
@@ -189,10 +161,6 @@ class MemberOptimizer(torch.optim.Optimizer):
         ((parameter,),) = (group["params"] for group in self.param_groups)
         return parameter
 
-    def observe(self, info: dict[str, Any]) -> None:
-        """See `SharedOptimizer.observe`; it is enough that one member is shown it."""
-        self.shared.observe(info)
-
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:  # type: ignore[override]  # closures are refused
         """Hand the gradient over (``.grad`` is None afterwards); the last member to be stepped updates all. Raises
@@ -220,12 +188,12 @@ class MemberOptimizer(torch.optim.Optimizer):
         return state
 
 
-def _one_row(gaussians: Gaussians, gradients: dict[str, Tensor | None], shares: Tensor) -> GaussianGradients:
-    """Autograd's gradients, name -> [N, ...], as one row, the sum over views; a missing one is zero. shares: [1, N]."""
+def _one_row(gaussians: Gaussians, gradients: dict[str, Tensor | None]) -> GaussianGradients:
+    """Autograd's gradients, name -> [N, ...], as one row, the sum over views; a missing one is zero."""
     rows, touched = {}, torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.device)
     for name, value in gaussians.items():
         found = gradients.get(name)
         gradient = torch.zeros_like(value) if found is None else found.reshape(value.shape)
         touched |= (gradient.unsqueeze(-1).flatten(1) != 0).any(dim=1)
         rows[name] = gradient if name == "shN" else gradient[None]
-    return GaussianGradients(**rows, touched=touched, view_losses=shares)
+    return GaussianGradients(**rows, touched=touched)

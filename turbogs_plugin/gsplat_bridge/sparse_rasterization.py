@@ -76,8 +76,7 @@ def sparse_rasterization(
         None (gsplat before 1.5: radii [C, N]). Gradients reach the five parameters and ``info["means2d"]`` alone.
 
         If "prediction" and "ground_truth" (colours alone, both [P, 3] or both [C, H, W, 3]) are put into `info` before
-        backward, "gaussian_stats" is in it after: the pass's `GaussianStats` with their error sums, and "loss_shares",
-        [N].
+        backward, "gaussian_stats" is in it after: the pass's `GaussianStats` with their error sums.
 
     Raises:
         InputError: a wrong shape, an option without support here, or cameras that a gradient is wanted of; and from
