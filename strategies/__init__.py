@@ -95,8 +95,8 @@ TYPES = {
         "mcmc": "density.mcmc:GsplatMcmcDensity",
     },
     "optimizer": {
-        "moment_lm": "optimizers.moment_lm:MomentLMOptimizer",
         "sparse_adam": "optimizers.sparse_adam:SparseAdam",
+        "moment_lm": "optimizers.moment_lm:MomentLMOptimizer",
         "adam": "optimizers.dense_adam:DenseAdam",
     },
 }

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from studies import CAPTURES, ROWS, Cells, Difference, change, duration, mean, ratio, result, study_cells, table, values
 
-DEFAULTS = ("cameras", "parts", "departures", "density_departures", "bounds")
+DEFAULTS = ("optimizer", "cameras", "parts", "departures", "density_departures", "bounds")
 """Studies in which each variant changes one thing of `turbogs`."""
 
 NOTICED = {"psnr": 0.03, "ssim": 0.0005}
@@ -49,7 +49,7 @@ PARTS = [Part(**row) for row in ROWS["paper parts"]]
 def compared(studies: Sequence[str], variants: tuple[str, str] | None) -> dict[str, tuple[Cells, Cells]]:
     """Capture -> trainings with a part and without it, where one of the studies has both."""
     found = {}
-    for capture in CAPTURES if variants else ():
+    for capture in (*CAPTURES, "bonsai", "train") if variants else ():
         for study in studies:
             cells = [study_cells(study).get(capture, {}).get(name) for name in variants or ()]
             if all(cells) and Difference.between(*cells, "psnr").count:
@@ -75,7 +75,7 @@ def verdict(pairs: Mapping[str, tuple[Cells, Cells]]) -> str:
         times = statistics.geometric_mean(ratio(*pair, measure) for pair in pairs.values())
         dear += [f"x {times:.2f} {unit}"] if times > DEARER else []
     text += f"; dearer: {', '.join(dear)}" if dear else ""
-    return text if len(pairs) == len(CAPTURES) else f"{text} ({', '.join(pairs)} alone)"
+    return text if len(pairs) >= len(CAPTURES) else f"{text} ({', '.join(pairs)} alone)"
 
 
 def paper_parts() -> str:
