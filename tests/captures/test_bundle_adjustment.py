@@ -110,7 +110,7 @@ def test_an_exact_reconstruction_stays():
     """Points to their last digits, as the observations were projected by sums in another order."""
     case = tracked(noise=0.0, shift=0.0)
     refined = refine_together(case.given, case.points, case.observations)
-    assert same(refined.cameras, case.given) and refined.count == 0
+    assert same(refined.cameras, case.given) and refined.changed == 0
     np.testing.assert_allclose(refined.points, case.points, rtol=0.0, atol=2e-15)
 
 
