@@ -75,7 +75,7 @@ class Solve:
 
 
 def reconstruct(photos: Path, out: Path) -> Solution:
-    """Find the cameras of photos (a folder of them, or one whose ``images`` are), and write a COLMAP capture into `out`,
+    """Find the cameras of photos (a folder of them, or one whose ``images`` are), and write a COLMAP capture to `out`,
     new or of an earlier call: ``images``, ``sparse/0`` and, where the photos have them, ``masks``.
 
     A call for photos of an earlier call that was stopped repeats no finished step; a finished reconstruction is told
