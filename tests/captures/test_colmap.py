@@ -16,7 +16,6 @@ from PIL import Image
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import find_model, read_colmap
 from turbogs_plugin.captures.load import holds_photos_alone
-from turbogs_plugin.errors import InputError
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
@@ -66,15 +65,15 @@ def test_reduced_copies_are_used_only_where_all_fit(tmp_path, case):
     assert scene.train.cameras.sizes[0].tolist() == [20, 12]
 
 
-def link_photos(folder: Path, each: bool = False) -> None:
-    """Photos are links to what is not there, or lie in one."""
+def link_photos(folder: Path) -> None:
     for path in sorted((folder / "images").iterdir()):
         path.unlink()
-        if each:
-            path.symlink_to(Path("/gone") / path.name)
-    if not each:
-        (folder / "images").rmdir()
-        (folder / "images").symlink_to("/gone")
+        path.symlink_to(Path("/gone") / path.name)
+
+
+def link_folder(folder: Path) -> None:
+    shutil.rmtree(folder / "images")
+    (folder / "images").symlink_to("/gone")
 
 
 DEEP, WRONG = Image.fromarray(np.full((24, 40), 3000, dtype=np.uint16)), Image.new("RGB", (24, 40))
@@ -89,27 +88,17 @@ def remove_photos(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (
-            lambda folder: (folder / "sparse/0/points3D.bin").unlink(),
-            r"has no points3D\.bin: bring back what is missing, or take that folder away and find",
-        ),
+        (lambda folder: (folder / "sparse/0/points3D.bin").unlink(), r"has no points3D\.bin: bring back what is"),
         (remove_photos, r"sparse/0 names 9 photos, of which 7 are missing in .*cup \(photo02.png, .*\): at least 3"),
-        (
-            lambda folder: link_photos(folder, each=True),
-            "photo00.png is a link to /gone/photo00.png, which",
-        ),
-        (link_photos, "images is a link to /gone, which is not there: copy that here"),
+        (link_photos, "photo00.png is a link to /gone/photo00.png, which"),
+        (link_folder, "images is a link to /gone, which is not there: copy that here"),
         (lambda folder: (folder / "images/photo03.png").write_bytes(b"\xff"), "cannot read the photo .*photo03.png"),
-        (
-            lambda folder: WRONG.save(folder / "images/photo03.png"),
-            "photo03.png is 24x40 but its camera is 40x24: it was cropped or turned",
-        ),
+        (lambda folder: WRONG.save(folder / "images/photo03.png"), "photo03.png is 24x40 but its camera is 40x24: it"),
         (lambda folder: DEEP.save(folder / "images/photo03.png"), "photo03.png has more than 8 bits a channel"),
     ],
 )
 def test_bad_files_are_named(tmp_path, damage, words):
-    folder = write_capture(tmp_path / "cup")
-    damage(folder)
+    damage(folder := write_capture(tmp_path / "cup"))
     assert_refused(words, load_scene, folder)
 
 
@@ -138,18 +127,11 @@ def test_photos_of_a_capture_name_the_capture(tmp_path, monkeypatch):
 
 
 def test_without_points_random_ones_are_drawn(tmp_path):
-    scene = load_scene(write_capture(tmp_path / "cup", num_points=0))
+    scene, again = load_scene(write_capture(tmp_path / "cup", num_points=0)), load_scene(tmp_path / "cup")
     assert len(scene.points) == len(scene.point_colors) == 50_000 and scene.drawn_points
-    assert scene.notes[0].endswith("9 images, 0 points")
-    again = load_scene(tmp_path / "cup")
-    assert torch.equal(scene.points, again.points)
-
-
-def test_a_model_without_images_is_refused(tmp_path):
-    (tmp_path / "sparse/0").mkdir(parents=True)
-    pycolmap.Reconstruction().write_binary(tmp_path / "sparse/0")
-    with pytest.raises(InputError, match="no images with a pose"):
-        load_scene(tmp_path)
+    assert scene.notes[0].endswith("9 images, 0 points") and torch.equal(scene.points, again.points)
+    pycolmap.Reconstruction().write_binary(tmp_path / "cup/sparse/0")
+    assert_refused("no images with a pose", load_scene, tmp_path / "cup")
 
 
 def test_of_several_models_the_largest_is_taken_and_said(tmp_path):
@@ -194,11 +176,10 @@ def test_a_point_that_is_too_far_for_float32_is_refused(tmp_path, place, refused
     model = pycolmap.Reconstruction(folder / "sparse/0")
     model.add_point3D(np.array([place, 0.0, 0.0]), pycolmap.Track(), np.zeros(3, dtype=np.uint8))
     model.write(folder / "sparse/0")
-    if not refused:
+    if refused:
+        assert_refused("1 of 21 3D points lie too far from the cameras for float32: take them out", load_scene, folder)
+    else:
         assert len(load_scene(folder).points) == 21
-        return
-    with pytest.raises(InputError, match="1 of 21 3D points lie too far from the cameras for float32: take them out"):
-        load_scene(folder)
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
@@ -216,31 +197,21 @@ def test_names_with_spaces(tmp_path, suffix):
     assert capture.viewmats[3] @ [3.0, 0, -5, 1] == pytest.approx([0, 0, 0, 1])
 
 
-def test_a_name_of_a_text_model_that_is_not_utf_8_is_refused(tmp_path):
-    folder = write_capture(tmp_path / "cup", suffix=".txt")
-    images = folder / "sparse/0/images.txt"
-    images.write_bytes(images.read_bytes().replace(b"photo03.png", b"ph\xf6to03.png"))
-    words = r"sparse/0: image name 'ph\\udcf6to03.png' has signs that cannot be printed: rename the photo"
-    assert_refused(words, load_scene, folder)
-
-
 @pytest.mark.parametrize(("size", "fits"), [((20, 12), True), ((21, 12), True), ((80, 48), True), ((20, 15), False)])
 def test_photos_in_other_sizes_than_their_cameras(tmp_path, size, fits):
     folder = write_capture(tmp_path / "cup")
     for path in (folder / "images").iterdir():
         Image.open(path).resize(size, Image.Resampling.BOX).save(path)
     if not fits:
-        with pytest.raises(InputError, match=r"photo00.png is 20x15 but its camera is 40x24: it was cropped"):
-            load_scene(folder)
+        assert_refused("photo00.png is 20x15 but its camera is 40x24: it was cropped", load_scene, folder)
         return
     scene = load_scene(folder)
     width, height = size
     assert scene.train.cameras.sizes.tolist() == [list(size)] * 7
     expected = [[50 * width / 40, 0, 21 * width / 40], [0, 52 * height / 24, 11 * height / 24], [0, 0, 1]]
     np.testing.assert_allclose(scene.train.cameras.Ks[0], expected, rtol=1e-6)
-    assert scene.notes[-1].endswith(
-        f"9 photos in another size than their cameras: intrinsics rescaled from 40x24 to {width}x{height}"
-    )
+    said = f"9 photos in another size than their cameras: intrinsics rescaled from 40x24 to {width}x{height}"
+    assert scene.notes[-1].endswith(said)
 
 
 def test_rigs(tmp_path):
@@ -298,6 +269,10 @@ def each_line(change):
     return lambda text: "".join(change(line.split(), line) + "\n" for line in text.splitlines() if line[:1] != "#")
 
 
+def exponential(word):
+    return f"{float(word):e}"
+
+
 def colors_as(form):
     return each_line(lambda words, line: " ".join([*words[:4], *(form(int(word)) for word in words[4:7]), *words[7:]]))
 
@@ -315,14 +290,8 @@ def colors_as(form):
         ("images", each_line(lambda words, line: line if "photo" in line else "")),
         ("images", lambda text: each_line(lambda words, line: line)(text).replace("\n\n", "\n")),
         ("images", lambda text: "\n".join(line for line in text.splitlines() if "photo" in line)),
-        (
-            "images",
-            lambda text: "\n".join("\t".join(line.split()) + " " for line in text.splitlines() if "#" not in line),
-        ),
-        (
-            "images",
-            each_line(lambda words, line: line if "photo" in line else " ".join(f"{float(word):e}" for word in words)),
-        ),
+        ("images", lambda text: "\n".join("\t".join(line.split()) + " " for line in text.splitlines())),
+        ("images", each_line(lambda words, line: line if "photo" in line else " ".join(map(exponential, words)))),
     ],
 )
 def test_text_as_scripts_and_other_programs_leave_it(tmp_path, file, change):
@@ -341,24 +310,20 @@ def test_text_as_scripts_and_other_programs_leave_it(tmp_path, file, change):
 @pytest.mark.parametrize(
     ("file", "old", "new", "words"),
     [
-        (
-            "cameras",
-            "50 52 21 11",
-            "50 52,5 21 11",
-            r"cameras.txt is damaged: line \d has '52,5' where a number should be",
-        ),
+        ("cameras", "50 52 ", "50 52,5 ", r"cameras.txt is damaged: line \d has '52,5' where a number should be"),
         ("cameras", "PINHOLE", "OPENCV", r"cameras.txt is damaged: line \d ends where a number should follow"),
         ("cameras", " 11\n", " 11 0.1\n", r"cameras.txt is damaged: line \d has '0.1' after its last number"),
         ("cameras", "40 24", "40.5 24", "has '40.5' where a number should be"),
         ("images", " 0 5 ", " 0 5m ", r"images.txt is damaged: line \d is not .* \('5m'\)"),
         ("points3D", " 2 3 ", " 2 white ", r"points3D.txt is damaged: line \d has 'white' where"),
+        ("images", "photo03.png", "ph\udcf6to03.png", r"sparse/0: image name 'ph\\udcf6to03.png' has signs"),
     ],
 )
 def test_damaged_text_is_named_by_file_line_and_word(tmp_path, file, old, new, words):
     folder = write_capture(tmp_path / "cup", suffix=".txt")
     path = folder / f"sparse/0/{file}.txt"
     assert old in path.read_text()
-    path.write_text(path.read_text().replace(old, new, 1))
+    path.write_text(path.read_text().replace(old, new, 1), errors="surrogateescape")
     assert_refused(words, load_scene, folder)
 
 

@@ -10,33 +10,26 @@ from PIL import ExifTags, Image
 
 from turbogs_plugin.captures import decoding, load_scene
 from turbogs_plugin.captures.decoding import photo_sizes, reduced_sizes
-from turbogs_plugin.errors import InputError
 
 SIZES = np.array([[640, 480], [500, 90]])
 
 
-@pytest.mark.parametrize(("factor", "expected"), [(1, SIZES), (4, [[160, 120], [125, 23]]), (25, [[26, 19], [20, 4]])])
-def test_sizes_are_to_the_nearest_pixel(factor, expected):
-    assert reduced_sizes(SIZES, factor).tolist() == np.asarray(expected).tolist()
+def test_sizes_are_to_the_nearest_pixel_and_a_factor_that_leaves_next_to_nothing_is_refused():
+    for factor, expected in ((1, SIZES.tolist()), (4, [[160, 120], [125, 23]]), (25, [[26, 19], [20, 4]])):
+        assert reduced_sizes(SIZES, factor).tolist() == expected
+    for factor in (26, 1000):
+        assert_refused(rf"--factor {factor} .*500x90: the largest .* is 25$", reduced_sizes, SIZES, factor)
 
 
-@pytest.mark.parametrize("factor", [26, 1000])
-def test_a_factor_that_leaves_next_to_nothing_is_refused(factor):
-    with pytest.raises(InputError, match=rf"--factor {factor} .*500x90: the largest .* is 25$"):
-        reduced_sizes(SIZES, factor)
-
-
-@pytest.mark.parametrize("orientation", [1, 3, 6])
-def test_a_tiff_that_pillow_would_turn_is_refused(tmp_path, orientation):
+def test_a_tiff_that_pillow_would_turn_is_refused(tmp_path):
     """Cameras are by the pixels as they are stored, and Pillow turns TIFFs before it is asked to."""
-    paths = [tmp_path / "photo.tif"]
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
-    Image.new("RGB", (8, 6)).save(paths[0], exif=exif)
-    if orientation == 1:
-        assert photo_sizes(paths).tolist() == [[8, 6]]
-    else:
-        assert_refused("photo.tif is a TIFF with an orientation in its EXIF data: ", photo_sizes, paths)
+    for orientation in (1, 3, 6):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        Image.new("RGB", (8, 6)).save(tmp_path / f"{orientation}.tif", exif=exif)
+    assert photo_sizes([tmp_path / "1.tif"]).tolist() == [[8, 6]]
+    for name in ("3.tif", "6.tif"):
+        assert_refused("tif is a TIFF with an orientation in its EXIF data: ", photo_sizes, [tmp_path / name])
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from PIL import Image
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.load import holds_photos_alone, other_poses
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.geometry import look_at
 
 POINTS = np.array([[0.3, 0.0, 0.1], [-0.2, 0.25, -0.3], [0.0, -0.4, 0.35]])
 VIEWS = 9
@@ -25,11 +26,8 @@ VIEWS = 9
 def pose_of(view: int) -> np.ndarray:
     """[3, 4] world to camera: 4 from the origin, looking at it, all a bit askew."""
     turn, tilt = 0.15 * (view - 4), 0.1 * (view % 3)
-    forward = -np.array([np.sin(turn) * np.cos(tilt), np.sin(tilt), np.cos(turn) * np.cos(tilt)])
-    right = np.cross([0.05, -1.0, 0.0], forward)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return np.concatenate([rotation, (rotation @ forward * 4.0)[:, None]], axis=1)
+    center = 4.0 * np.array([np.sin(turn) * np.cos(tilt), np.sin(tilt), np.cos(turn) * np.cos(tilt)])
+    return look_at(center, np.zeros(3), np.array([-0.05, 1.0, 0.0]))[:3]
 
 
 def seen_at(view: int, camera: pycolmap.Camera) -> np.ndarray:
@@ -69,8 +67,8 @@ def pinhole(width: int, height: int, focal: float) -> pycolmap.Camera:
 
 
 def require_painted(scene: Scene) -> None:
-    require_points_at_their_pixels(scene, scene.train, POINTS)
-    require_points_at_their_pixels(scene, scene.test, POINTS)
+    for views in (scene.train, scene.test):
+        require_points_at_their_pixels(scene, views, POINTS)
 
 
 NAMES = [f"_DSC{8670 + view}.png" for view in range(VIEWS)]
@@ -109,9 +107,11 @@ def write_nerfstudio(folder: Path, cameras: list[pycolmap.Camera], names: list[s
     everything |= {"applied_transform": np.eye(4)[:3].tolist(), "ply_file_path": "sparse_pc.ply", **content}
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "transforms.json").write_text(json.dumps(everything))
-    header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-    header += "property uint8 red\nproperty uint8 green\nproperty uint8 blue\nend_header\n"
-    (folder / "sparse_pc.ply").write_text(header + "".join(f"{x} {y} {z} 9 8 7\n" for x, y, z in POINTS))
+    names = (*(f"float {axis}" for axis in "xyz"), "uint8 red", "uint8 green", "uint8 blue")
+    header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property {name}\n" for name in names)
+    (folder / "sparse_pc.ply").write_text(
+        f"{header}end_header\n" + "".join(f"{x} {y} {z} 9 8 7\n" for x, y, z in POINTS)
+    )
 
 
 @pytest.mark.parametrize("model", ["colmap/sparse/0", "colmap_sparse/0", "colmap_text", ""])
@@ -171,10 +171,7 @@ def test_one_camera_a_photo_upright_and_lying(tmp_path, kind):
 @pytest.mark.parametrize(
     ("files", "words"),
     [
-        (
-            ["opensfm/reconstruction.json"],
-            "opensfm/reconstruction.json is not read, .* of OpenSfM or ODM: ns-process-data",
-        ),
+        (["opensfm/reconstruction.json"], "reconstruction.json is not read, .* of OpenSfM or ODM: ns-process-data"),
         (["cameras.xml"], "cameras.xml is not read, .* of Metashape"),
         (["corrected_cameras/1.json"], "1.json is not read, .* of Polycam"),
         ([], "has 3 photos and nothing that says where they were taken from: find the cameras by 'turbogs reconstruct"),

@@ -17,17 +17,12 @@ QUARTER = np.linspace(0, np.pi / 2, VIEWS)
 LINE = np.arange(VIEWS)[:, None] * np.array([1.0, 0.0, 0.0])
 
 
-def poses(centers: np.ndarray, forwards: np.ndarray) -> np.ndarray:
-    """[V, 4, 4] camera to world, in OpenGL's axes."""
-    up = np.array([0.0, 1.0, 0.0])
-    matrices = np.tile(np.eye(4), (len(centers), 1, 1))
-    matrices[:, :3] = np.stack([np.cross(forwards, up), 0 * forwards + up, -forwards, centers], axis=2)
-    return matrices
-
-
 def cameras_of(centers: np.ndarray, forwards: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """World-to-camera matrices, intrinsics and sizes."""
-    viewmats = np.linalg.inv(poses(centers, forwards) @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    down = np.array([0.0, -1.0, 0.0])
+    poses = np.tile(np.eye(4), (len(centers), 1, 1))
+    poses[:, :3] = np.stack([np.cross(down, forwards), 0 * forwards + down, forwards, centers], axis=2)
+    viewmats = np.linalg.inv(poses)
     K = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]])
     return viewmats, np.tile(K, (len(viewmats), 1, 1)), np.tile(SIZE, (len(viewmats), 1))
 
@@ -104,19 +99,14 @@ def test_the_mean_of_the_pixels_that_see_a_point():
     np.testing.assert_allclose(found[3], [(9 + 12 + 21 + 200 + 5 * shift) / 5 for shift in (0, 0.6, 1.2)], atol=1)
 
 
-def test_masked_pixels_give_no_colour():
+def test_masked_pixels_give_no_colour_and_transparent_ones_count_by_their_alpha():
     cameras, photos = two_views()
     keep = [torch.ones(2, 4, dtype=torch.bool), torch.zeros(3, 2, dtype=torch.bool)]
     points = torch.tensor([[0.6, -0.4, 1.0]])  # pixel 3 of the first, which is 9, 10, 11
     assert colors_in_photos(points, cameras, photos, PixelMasks.from_images(keep)).tolist() == [[9, 10, 11]]
     keep[0][0, 3] = False  # then the mean of nothing that was seen
     assert colors_in_photos(points, cameras, photos, PixelMasks.from_images(keep)).tolist() == [[128, 128, 128]]
-
-
-def test_transparent_pixels_count_by_their_alpha():
-    cameras, photos = two_views()
     alphas = torch.tensor([51] * 8 + [204] * 6)[:, None]  # 0.2 and 0.8; pixel 3 of the first has 50, 100, 0 there
     colors = torch.cat([photos.colors.long() * alphas // 255, alphas], dim=1).to(torch.uint8)
     colors[3, :3] = torch.tensor([10, 20, 0])
-    found = colors_in_photos(torch.tensor([[0.6, -0.4, 1.0]]), cameras, Photos(colors, photos.sizes))
-    assert found.tolist() == [[90, 100, 80]]
+    assert colors_in_photos(points, cameras, Photos(colors, photos.sizes)).tolist() == [[90, 100, 80]]

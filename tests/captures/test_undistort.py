@@ -17,6 +17,7 @@ from turbogs_plugin.captures.undistort import lens_of_camera
 pytestmark = pytest.mark.usefixtures("few_random_points")
 
 WIDTH, HEIGHT = 320, 240
+FISHEYE = {"camera_model": "OPENCV_FISHEYE"}
 PARAMS = {
     "OPENCV": [260.0, 270.0, 163.0, 117.0, 0.12, -0.05, 0.004, -0.003],
     "FULL_OPENCV": [260.0, 270.0, 163.0, 117.0, 0.12, -0.05, 0.004, -0.003, 0.02, 0.05, 0.01, 0.0],
@@ -77,8 +78,8 @@ def bent_photo(model: str, params: list[float]) -> np.ndarray:
     return pattern(straighten((pixel_centers(WIDTH, HEIGHT) - params[2:4]) / params[:2], model, params))
 
 
-def camera(model: str, params: list[float], width: int = WIDTH, height: int = HEIGHT) -> pycolmap.Camera:
-    return pycolmap.Camera(model=model, width=width, height=height, params=params, camera_id=1)
+def camera(model: str, params: list[float]) -> pycolmap.Camera:
+    return pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params, camera_id=1)
 
 
 def with_photos(folder: Path, photo: np.ndarray) -> Path:
@@ -120,18 +121,10 @@ def test_colmap_photos_are_those_of_a_pinhole(tmp_path, model):
     ("content", "model", "params"),
     [
         ({"k1": 0.12, "k2": -0.05, "p1": 0.004, "p2": -0.003}, "OPENCV", [0.12, -0.05, 0.004, -0.003]),
-        (
-            {"k1": 0.12, "k2": -0.05, "k3": 0.03, "p1": 0.004, "p2": 0.001},
-            "FULL_OPENCV",
-            [0.12, -0.05, 0.004, 0.001, 0.03, 0.0, 0.0, 0.0],
-        ),
-        (
-            {"camera_model": "OPENCV_FISHEYE", "k1": 0.03, "k2": -0.01, "k3": 0.002, "k4": 0.001},
-            "OPENCV_FISHEYE",
-            [0.03, -0.01, 0.002, 0.001],
-        ),
+        ({"k1": 0.12, "k3": 0.03, "p1": 0.004, "p2": 0.001}, "FULL_OPENCV", [0.12, 0, 0.004, 0.001, 0.03, 0, 0, 0]),
+        ({**FISHEYE, "k1": 0.03, "k2": -0.01, "k3": 0.002, "k4": 0.001}, "OPENCV_FISHEYE", [0.03, -0.01, 0.002, 0.001]),
         ({"is_fisheye": True, "k1": 0.03}, "OPENCV_FISHEYE", [0.03, 0.0, 0.0, 0.0]),
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE", [0.0, 0.0, 0.0, 0.0]),
+        (FISHEYE, "OPENCV_FISHEYE", [0.0, 0.0, 0.0, 0.0]),
     ],
 )
 def test_transforms_photos_are_those_of_a_pinhole(tmp_path, content, model, params):

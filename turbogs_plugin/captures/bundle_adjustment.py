@@ -88,14 +88,14 @@ class Refinement(NamedTuple):
     cameras: Pinholes
     points: np.ndarray  # [M, 3]
     spread: np.ndarray  # [PARAMETERS, PARAMETERS], covariance of how far cameras have moved (`Pinholes.moved`)
-    count: int  # of cameras that are others than those that were given
+    changed: int  # cameras that are others than those that were given
     before: float  # median of `reprojection_errors`, pixels
     after: float
 
     def text(self, called: str) -> str:
         """One line on the refinement. `called` names the cameras."""
         return (
-            f"{self.count} of {len(self.cameras.focal)} {called} refined, each with a lens of its own: points are "
+            f"{self.changed} of {len(self.cameras.focal)} {called} refined, each with a lens of its own: points are "
             f"{self.after:.2f} pixels from where photos show them, {self.before:.2f} before (medians)"
         )
 
@@ -310,7 +310,7 @@ def find_cameras(scene: Scene, training: bool = True) -> RefinedCameras | None:
     together = refine_together(given, places, shown)
     train, points, error = scene.train.cameras, scene.points, together.before
     notes: tuple[str, ...] = ()
-    if training and together.count:
+    if training and together.changed:
         places, error, notes = together.points, together.after, (together.text("training cameras"),)
         train, points = _cameras(together.cameras, train), torch.from_numpy(places).float()
     beside = refine_alone(tested, places, seen, together.spread)

@@ -279,10 +279,11 @@ def _read_points(path: Path) -> np.ndarray:
         colors = values[:, 3:]
         if np.isfinite(colors).all() and (colors == np.rint(colors)).all():
             colors = colors.astype(np.int64)
-        xyz, colors = values[:, :3], read_colors(path, dict(zip(("red", "green", "blue"), colors.T, strict=True)))
+        given = dict(zip(("red", "green", "blue"), colors.T, strict=True))
+        xyz, rgb = values[:, :3], read_colors(path, given)
     else:
-        xyz, colors, _ = read_cloud(path)
+        xyz, rgb, _ = read_cloud(path)
         numbers = np.arange(len(xyz), dtype=np.uint64) + FIRST_OF_CLOUD
     points = np.zeros(len(xyz), POINT)
-    points["id"], points["xyz"], points["color"] = numbers, xyz, colors
+    points["id"], points["xyz"], points["color"] = numbers, xyz, rgb
     return points

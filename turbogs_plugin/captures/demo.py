@@ -41,7 +41,7 @@ PHOTO_NAME = "view_{:03d}.png"
 @dataclass
 class Solid:
     """A solid on the vertical axis of its own coordinates. In these, `intersect` gives distances [R] along rays from
-    `origin` [3] in `directions` [R, 3], infinite where they miss it; `normal`, outward unit normals [R, 3] at points."""
+    `origin` [3] in `directions` [R, 3], infinite where they miss it; `normal`, unit normals [R, 3] at points on it."""
 
     size: float | np.ndarray  # radius, or half of each side of a box [3]
     texture: Texture

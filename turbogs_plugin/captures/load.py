@@ -113,7 +113,7 @@ def load_scene(
             how = "zero in a mask, or in the alpha of a photo, is masked; mend the masks, or take them away"
             raise InputError(f"{scene}: all {part.sum()} {name} photos are masked whole: {how}")
     views, count = np.concatenate(parts), len(parts[0])
-    paths, lenses = ([of_view[view] for view in views] for of_view in (files, capture.lenses))
+    paths, lenses = [files[view] for view in views], [capture.lenses[view] for view in views]
     channels = channels_of(paths) if capture.alpha == "opacity" else 3
     photos = load_photos(paths, sizes[views], lenses, channels, progress)  # in one array: its room is found once
     first = int(photos.offsets[count])

@@ -182,8 +182,8 @@ def find_named(
         path, name = ways[0]  # more than the suffix is another
         notes.append(f"{len(ways)} photos are not where {source.name} says: {path} is taken for {name}, ...")
     if absent:
-        said = f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {named(absent, most=1)}"
-        notes.append("; ".join(filter(None, (said, link))))
+        gone = f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {named(absent, most=1)}"
+        notes.append("; ".join(filter(None, (gone, link))))
     inner = {path.split("/")[0] if "/" in path else "" for path, _ in pairs}
     folder = scene / inner.pop() if len(inner) == 1 else scene
     shown = tuple((scene / path).relative_to(folder).as_posix() for path, _ in pairs)

@@ -198,17 +198,16 @@ def _read_camera(values: Frame, photo: Path, source: Path) -> tuple[np.ndarray, 
     fisheye = str(values.get("is_fisheye")).lower() in ("true", "1")
     model = str(values.get("camera_model", FISHEYE if fisheye else "OPENCV")).upper()
     if model not in (*BROWN_MODELS, FISHEYE):
-        known = ", ".join((*BROWN_MODELS, FISHEYE))
-        raise InputError(f"{owner} is a {model[:40]!r}: known are {known}; use the capture's COLMAP reconstruction")
+        models = ", ".join((*BROWN_MODELS, FISHEYE))
+        raise InputError(f"{owner} is a {model[:40]!r}: known are {models}; use the capture's COLMAP reconstruction")
     bends = {key: number(key, 0.0) or 0.0 for key in BENDS}
     known = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "k3", "p1", "p2")
     if unknown := " and ".join(key for key, value in bends.items() if value and key not in known):
         raise InputError(f"{owner} has {unknown}, which {model} does not have: use the capture's COLMAP reconstruction")
     if model != FISHEYE and not any(bends.values()):
         return K, size, None
-    kind, keys = ("FULL_OPENCV", BENDS) if bends["k3"] else ("OPENCV", BENDS[:4])
-    if model == FISHEYE:
-        kind, keys = FISHEYE, known
+    kind = model if model == FISHEYE else "FULL_OPENCV" if bends["k3"] else "OPENCV"
+    keys = {FISHEYE: known, "FULL_OPENCV": BENDS, "OPENCV": BENDS[:4]}[kind]
     params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *(bends[key] for key in keys)]
     lens = lens_of_camera(load_pycolmap().Camera(model=kind, width=size[0], height=size[1], params=params), owner)
     return (K, size, None) if lens is None else (lens.K, lens.size, lens)

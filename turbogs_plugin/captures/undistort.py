@@ -48,8 +48,8 @@ class Lens:
         return self.camera.width, self.camera.height
 
     def size_of(self, photo_size: tuple[int, int]) -> tuple[int, int]:
-        """(width, height) of the pinhole's image for photos of a size: smaller for ones below `photo_size`, no larger for
-        others."""
+        """(width, height) of the pinhole's image for photos of a size: smaller for ones below `photo_size`, but no
+        larger for others."""
         ratios = np.divide(photo_size, self.photo_size).clip(max=1.0)
         width, height = np.floor(np.multiply(self.size, ratios) + 0.5).astype(np.int64).clip(min=1).tolist()
         return width, height

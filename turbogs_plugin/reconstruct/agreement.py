@@ -31,18 +31,12 @@ POWER = 1.5
 
 @dataclass(frozen=True)
 class Agreement:
-    """How the matches of P pairs of V photos agree with the cameras of a solve.
+    """How the matches of P pairs of V photos agree with the cameras of a solve."""
 
-    Args:
-        names: of the V photos.
-        pairs: [P, 2] int64, indices into `names`.
-        agreeing, contradicting: [P] int64, numbers of verified matches on, and off, the epipolar lines of the cameras.
-    """
-
-    names: tuple[str, ...]
-    pairs: np.ndarray
-    agreeing: np.ndarray
-    contradicting: np.ndarray
+    names: tuple[str, ...]  # of the photos
+    pairs: np.ndarray  # [P, 2] int64, places among the names
+    agreeing: np.ndarray  # [P] int64, verified matches on the epipolar lines of the cameras
+    contradicting: np.ndarray  # [P] int64, verified matches off these lines
 
     @property
     def contradicts(self) -> np.ndarray:
@@ -51,22 +45,16 @@ class Agreement:
 
 
 def consistent_groups(agreement: Agreement) -> list[list[int]]:
-    """Photos in groups that the matches hold together, the largest group first; between two groups the contradicting
-    matches outweigh the agreeing ones.
-
-    Returns:
-        Ascending indices of photos. All photos in one group: no majority contradicts the solve.
-    """
+    """Photos, by ascending places, in groups that the matches hold together, the largest first; between two groups the
+    contradicting matches outweigh the agreeing ones. All photos in one group: no majority contradicts the solve."""
     weights = agreement.agreeing**POWER - agreement.contradicting**POWER
     weights[~_strongest(agreement)] *= WEAK
     return _contracted(len(agreement.names), agreement.pairs, weights)
 
 
 def ghost_pairs(agreement: Agreement, groups: list[list[int]]) -> np.ndarray:
-    """[P] bool: pairs that agree with the solve, between groups that more matches say are elsewhere.
-
-    The solve went by these pairs when it put the groups in their places.
-    """
+    """[P] bool: pairs that agree with the solve, between groups that more matches say are elsewhere: by these the solve
+    put the groups in their places."""
     group = np.zeros(len(agreement.names), dtype=np.int64)
     for number, members in enumerate(groups):
         group[members] = number

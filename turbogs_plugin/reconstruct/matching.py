@@ -28,12 +28,8 @@ NUMBER = re.compile(r"^(.*?)(\d+)(\D*)$", re.DOTALL)
 
 
 def choose_pairs(names: Sequence[str], positions: np.ndarray) -> tuple[np.ndarray, str]:
-    """Pairs to match, [P, 2] int64, indices of photos, the lower first, each pair once; and why these, for the user.
-
-    Args:
-        names: of V photos.
-        positions: [V, 2] float64, degrees of latitude and longitude; NaN where a photo has none.
-    """
+    """Pairs to match, [P, 2] int64, indices of V photos, the lower first, each pair once; and why these, for the user.
+    `positions`: [V, 2] float64, degrees of latitude and longitude; NaN where a photo has none."""
     count = len(names)
     every = np.stack(np.triu_indices(count, 1), axis=1)
     if count <= FEW:
@@ -82,11 +78,7 @@ def natural_order(names: Sequence[str]) -> np.ndarray:
 def are_ordered(names: Sequence[str]) -> bool:
     """Whether names in natural order are a walk's or a film's: numbers that grow by small steps."""
     parts = [NUMBER.match(PurePosixPath(name).with_suffix("").as_posix()) for name in names]
-    follows = [
-        first is not None
-        and second is not None
-        and (first[1], first[3]) == (second[1], second[3])
-        and 0 < int(second[2]) - int(first[2]) <= LARGEST_STEP
-        for first, second in pairwise(parts)
-    ]
-    return bool(follows) and sum(follows) >= ORDERED_SHARE * len(follows)
+    pairs = [first and second and (first.groups(), second.groups()) for first, second in pairwise(parts)]
+    numbered = [(int(one[1]), int(two[1])) for one, two in filter(None, pairs) if one[::2] == two[::2]]
+    follows = sum(0 < second - first <= LARGEST_STEP for first, second in numbered)
+    return bool(pairs) and follows >= ORDERED_SHARE * len(pairs)

@@ -33,23 +33,14 @@ JPEG_QUALITY = 95
 
 @dataclass(frozen=True)
 class PhotoFile:
-    """A photo on the disk.
+    """A photo on the disk."""
 
-    Args:
-        name: relative to the folder of photos, with ``/``, and with ``_`` for what COLMAP's lists take for separators.
-        path: of the file.
-        size: (width, height) of the upright photo.
-        turned: EXIF says that the file is not upright.
-        lens: text that is equal for photos of one lens: camera, focal length and size.
-        stamp: bytes and time of the last change in ns, by which a later call knows the file again.
-    """
-
-    name: str
+    name: str  # relative to the folder of photos, by `plain_name`
     path: Path
-    size: tuple[int, int]
-    turned: bool
-    lens: str
-    stamp: tuple[int, int]
+    size: tuple[int, int]  # (width, height) of the upright photo
+    turned: bool  # EXIF says that the file is not upright
+    lens: str  # camera, focal length and size: equal for photos of one lens
+    stamp: tuple[int, int]  # bytes and time of the last change in ns, by which a later call knows the file again
 
 
 def plain_name(path: Path) -> str:
@@ -58,12 +49,9 @@ def plain_name(path: Path) -> str:
 
 
 def read_photos(folder: Path) -> list[PhotoFile]:
-    """The photos of a folder, in the order of their names. Each is decoded once, coarsely.
-
-    Raises:
-        InputError: no folder, or a run's; fewer than `FEWEST_PHOTOS` photos; names that a capture cannot have; a photo
-            that cannot be read (the first in order).
-    """
+    """The photos of a folder, in the order of their names. Each is decoded once, coarsely. Raises `InputError` for no
+    folder, or a run's; fewer than `FEWEST_PHOTOS` photos; names that a capture cannot have; a photo that cannot be read
+    (the first in order)."""
     reason = f" ({text})" if (text := unread(folder, every=True)) else ""
     if not folder.is_dir():
         raise InputError(f"no such folder of photos: {folder}{reason}")
@@ -87,10 +75,8 @@ def read_photos(folder: Path) -> list[PhotoFile]:
 
 
 def place_photos(photos: Sequence[PhotoFile], folder: Path) -> None:
-    """Put the photos into a folder: upright ones as links where the disk can, else as copies; the others turned.
-
-    Files that are there already stay.
-    """
+    """Put the photos into a folder: upright ones as links where the disk can, else as copies; the others turned. Files
+    that are there already stay."""
 
     def place(photo: PhotoFile) -> None:
         target = folder / photo.name
@@ -107,17 +93,9 @@ def place_photos(photos: Sequence[PhotoFile], folder: Path) -> None:
 
 
 def place_masks(folder: Path, place: Path, photos: Sequence[PhotoFile], target: Path) -> None:
-    """Put the masks of photos, from a folder of masks in `folder`, in the photos' folder or beside it, into `target`.
-
-    A mask of the stored size of a photo that is not upright is turned as its photo is.
-
-    Args:
-        folder: as the user gave it.
-        place: folder that the photos' paths begin with.
-
-    Raises:
-        InputError: a mask that is no image, or has not its photo's size.
-    """
+    """Put the masks of photos into `target`, from a folder of masks in `folder` (as the user gave it), in the photos'
+    folder `place` or beside it. A mask of the stored size of a photo that is not upright is turned as its photo is.
+    Raises `InputError` for a mask that is no image, or has not its photo's size."""
     folders = [parent / FOLDER for parent in dict.fromkeys((folder, place.parent, place))]
     find = mask_finder(folders, place)
 

@@ -37,21 +37,14 @@ SMALLEST_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Solution:
-    """What a reconstruction came to.
+    """What a reconstruction came to."""
 
-    Args:
-        scene: the capture's folder: ``images`` and ``sparse/0``.
-        photos, registered, points: their numbers.
-        left_out: names of the photos that are not in the model.
-        notes: lines for the user.
-    """
-
-    scene: Path
-    photos: int
+    scene: Path  # the capture's folder: images and sparse/0
+    photos: int  # their number, and those of photos in the model and of its points
     registered: int
     points: int
-    left_out: list[str]
-    notes: list[str]
+    left_out: list[str]  # names of the photos that are not in the model
+    notes: list[str]  # lines for the user
 
     def text(self) -> str:
         return "\n".join([*self.notes, f"scene  {self.scene}"])
@@ -59,17 +52,11 @@ class Solution:
 
 @dataclass(frozen=True)
 class Solve:
-    """A model with what the matches say about it.
+    """A model with what the matches say about it."""
 
-    Args:
-        model: the one with most photos.
-        agreement: of all matches with the model.
-        groups: photos that the matches put together, as indices into the agreement's names, the largest group first.
-    """
-
-    model: pycolmap.Reconstruction
-    agreement: Agreement
-    groups: list[list[int]]
+    model: pycolmap.Reconstruction  # the one with most photos
+    agreement: Agreement  # of all matches with the model
+    groups: list[list[int]]  # photos, by their places among the agreement's names, that the matches put together
 
     @property
     def placed(self) -> int:
@@ -88,15 +75,11 @@ class Solve:
 
 
 def reconstruct(photos: Path, out: Path) -> Solution:
-    """Find the cameras of photos, and write a COLMAP capture: ``images``, ``sparse/0`` and, where the photos have them,
-    ``masks``.
+    """Find the cameras of photos (a folder of them, or one whose ``images`` are), and write a COLMAP capture to `out`,
+    new or of an earlier call: ``images``, ``sparse/0`` and, where the photos have them, ``masks``.
 
     A call for photos of an earlier call that was stopped repeats no finished step; a finished reconstruction is told
     again. Masks are put in place at each call; a mask that is gone stays in the capture.
-
-    Args:
-        photos: a folder of photos, or a folder whose ``images`` are.
-        out: the capture's folder, new or of an earlier call.
 
     Raises:
         InputError: photos or folder are not usable, or the photos cannot be solved. Then a new folder `out` is gone.
@@ -128,11 +111,7 @@ def scene_beside(photos: Path, run: Path) -> Path:
 
 
 def reconstruct_beside(photos: Path, run: Path) -> Path:
-    """Find the cameras of a folder of photos alone (`holds_photos_alone`) for a run; folder of the reconstruction.
-
-    Raises:
-        InputError: as `reconstruct`.
-    """
+    """Find the cameras of a folder of photos alone (`holds_photos_alone`) for a run (`reconstruct`); their capture."""
     scene = scene_beside(photos, run)
     print(f"{photos} has photos alone: their cameras are found first, into {scene}", file=sys.stderr, flush=True)
     print("\n".join(reconstruct(photos, scene).notes), file=sys.stderr, flush=True)
@@ -141,10 +120,7 @@ def reconstruct_beside(photos: Path, run: Path) -> Path:
 
 def _begin(photos: Sequence[PhotoFile], out: Path) -> bool:
     """Make the folder of a scene and list its photos, or see that an earlier call listed them, too; whether it is new.
-
-    Raises:
-        InputError: the folder holds something else, or a reconstruction of other photos.
-    """
+    Raises `InputError` where the folder holds something else, or a reconstruction of other photos."""
     listed = out / "reconstruction" / "photos.json"
     text = json.dumps({photo.name: photo.stamp for photo in photos}, indent=1)
     known = read_text(listed)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
@@ -36,13 +35,9 @@ BLOCK = 128
 
 
 def extract_features(database: Path, images: Path, photos: Sequence[PhotoFile], doubled: bool) -> None:
-    """SIFT features of all photos into the database, one camera for each lens. A database that has all photos stays;
-    another one, of a call that was stopped, is made anew.
-
-    Args:
-        doubled: look for features at twice the size, too, as COLMAP does by default: two to three times as many in
-            three times the time.
-    """
+    """SIFT features of all photos into the database, one camera for each lens; `doubled` at twice the size, too, as
+    COLMAP does by default: two to three times as many in three times the time. A database that has all photos stays;
+    another one, of a call that was stopped, is made anew."""
     pycolmap = _pycolmap()
     if database.is_file():
         with pycolmap.Database.open(database) as opened:
@@ -55,35 +50,24 @@ def extract_features(database: Path, images: Path, photos: Sequence[PhotoFile], 
     lenses: dict[str, list[str]] = defaultdict(list)
     for photo in photos:
         lenses[photo.lens].append(photo.name)
-    with _told(f"features of {len(photos)} photos"):
-        for names in lenses.values():
-            reader = pycolmap.ImageReaderOptions()
-            reader.camera_model = "OPENCV" if len(names) >= MANY else DEFAULT_MODEL
-            pycolmap.extract_features(
-                database,
-                images,
-                image_names=names,
-                camera_mode=pycolmap.CameraMode.SINGLE,
-                reader_options=reader,
-                extraction_options=options,
-            )
+    for names in lenses.values():
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = "OPENCV" if len(names) >= MANY else DEFAULT_MODEL
+        pycolmap.extract_features(database, images, names, pycolmap.CameraMode.SINGLE, reader, options)
+    _tell(f"features of {len(photos)} photos")
 
 
 def match_features(database: Path, scratch: Path, pairs: Sequence[tuple[str, str]]) -> None:
-    """Match and verify pairs of photos; pairs that are done already are passed over.
-
-    Args:
-        scratch: a folder for the list of pairs.
-        pairs: names of photos.
-    """
+    """Match and verify pairs of photos' names, which a file in `scratch` lists; pairs that are done already are passed
+    over."""
     pycolmap = _pycolmap()
     options, geometry = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     options.num_threads, geometry.ransac.random_seed = torch.get_num_threads(), 0
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path, pairing.block_size = scratch / "pairs.txt", BLOCK
     pairing.match_list_path.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
-    with _told(f"{len(pairs):,} pairs of photos matched"):
-        pycolmap.match_image_pairs(database, options, pairing, geometry)
+    pycolmap.match_image_pairs(database, options, pairing, geometry)
+    _tell(f"{len(pairs):,} pairs of photos matched")
 
 
 def solve_cameras(database: Path, images: Path, scratch: Path) -> list[pycolmap.Reconstruction]:
@@ -97,8 +81,8 @@ def solve_cameras(database: Path, images: Path, scratch: Path) -> list[pycolmap.
     place = scratch / "models"
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True)
-    with _told("cameras solved"):
-        models = pycolmap.incremental_mapping(database, images, place, options)
+    models = pycolmap.incremental_mapping(database, images, place, options)
+    _tell("cameras solved")
     return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 
@@ -134,9 +118,8 @@ def measure_agreement(model: pycolmap.Reconstruction, database: Path) -> Agreeme
 
 
 def epipolar_distances(relative: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """[N] Sampson distances of matches from the epipolar lines of two cameras, at a focal length of 1.
-
-    Cameras in one place have no lines: there, nothing is far.
+    """[N] Sampson distances of matches from the epipolar lines of two cameras, at a focal length of 1; 0 for cameras in
+    one place, which have no lines.
 
     Args:
         relative: [4, 4], from the first camera to the second.
@@ -183,10 +166,8 @@ def _pycolmap() -> ModuleType:
     return module
 
 
-@contextmanager
-def _told(step: str) -> Iterator[None]:
-    """Say on stderr which step has ended. pycolmap ends a step that Ctrl-C interrupts."""
-    yield
+def _tell(step: str) -> None:
+    """Say on stderr which step has ended."""
     print(step, file=sys.stderr, flush=True)
 
 
