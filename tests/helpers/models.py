@@ -1,22 +1,13 @@
 """Models that tests of several rooms share."""
 
-from pathlib import Path
-
 import numpy as np
 import torch
 
-from turbogs_plugin.model.ply import read_ply
-from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.types import Gaussians
 
 OWN = Frame(np.zeros(3), 1.0)
 """A capture's own coordinates."""
-
-
-def load_ply(path: Path, frame: Frame = OWN) -> Gaussians:
-    """A file's model as training and rendering take it."""
-    return placed(read_ply(path), Similarity.into(frame), path)
 
 
 def random_gaussians(count: int = 40, sh_degree: int = 3, seed: int = 0, dtype=torch.float32) -> Gaussians:

@@ -73,7 +73,7 @@ def test_a_watched_training_ends_as_an_unwatched_one(unwatched, watched, monkeyp
     monkeypatch.setitem(frames.SHORTEST_INTERVALS, True, 0.0)
     page, live, loop = watched(f"train.pixels_place={place}")
     loop.run()
-    assert live._state(loop.trainer).samples.filled.any()
+    assert live._state().samples.filled.any()
     assert len(page.pictures) >= loop.trainer.iteration > 10 and len({frame.tobytes() for frame in page.pictures}) > 6
     assert_identical(loop.trainer.state_dict(), unwatched)
     assert any("Gaussians" in text and "iteration" in text for text in page.said)

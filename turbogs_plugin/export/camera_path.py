@@ -21,8 +21,6 @@ from turbogs_plugin.yaml_json import parse_json
 
 MOST_KEYS = 24
 """Largest number of a capture's cameras that a path goes through, evenly spread: more would make it jitter."""
-MOST_POINTS = 1000
-"""Points of a capture that tell in which of nerfstudio's worlds a path is."""
 SWING = math.pi
 """Largest gap in radians between cameras that surround what they look at; beyond it an orbit swings."""
 WIDEST_FILM = 1920
@@ -92,7 +90,7 @@ def from_file(path: Path, scene: Scene, frames: int) -> Cameras:
     viewmats, Ks, sizes = (np.stack(each) for each in zip(*cameras, strict=True))
     Ks[:, :2] *= (sizes[0] / sizes)[:, :, None]
     if changes:
-        points = scene.frame.restore_points(scene.points[evenly(len(scene.points), MOST_POINTS)].cpu().numpy())
+        points = scene.frame.restore_points(scene.points[evenly(len(scene.points), 1000)].cpu().numpy())
         moved, some = [change.apply_to_poses(viewmats) for change in changes], evenly(len(viewmats), MOST_KEYS)
         viewmats = max(moved, key=lambda each: _seen(each[some], Ks[some], points))
     return interpolated(scene.frame.normalise_poses(viewmats), Ks, sizes[0], frames)

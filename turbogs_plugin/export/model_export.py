@@ -17,7 +17,7 @@ from torch import Tensor
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.render import dense_samples, rasterize
-from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
+from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.html_page import html_page, page_gaussians
 from turbogs_plugin.export.scene_files import read_splat, save_glb, save_splat, save_usda
@@ -94,8 +94,6 @@ def export_run(
     if is_page and scene is not None:
         written = page_gaussians(kept, scene.train.cameras, model.sh_degree)
     else:
-        if (eps2d := model.config.raster.eps2d) != (usual := DEFAULT_SETTINGS.eps2d):
-            notes.append(f"trained with raster.eps2d={eps2d:g}, which no file holds: most add {usual:g}")
         if (origin := local_origin(frame)).any():
             frame = Frame(frame.center - origin, frame.scale)
             notes.append(f"about the local origin {' '.join(f'{value:.12g}' for value in origin)}")

@@ -32,8 +32,8 @@ from turbogs_plugin.files import require_writable
 if TYPE_CHECKING:
     import pycolmap
 
-PHOTOS, MODEL = "images", "sparse"
-"""Folders of the new capture."""
+LINKED = re.compile(rf"(images|{MASKS})(_\d+)?")
+"""Folders of photos, reduced photos and masks, which the new capture has links to."""
 
 
 def write_refined(scene: Path, out: Path) -> str:
@@ -81,11 +81,12 @@ def write_refined(scene: Path, out: Path) -> str:
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".") as temporary:
         folder = Path(temporary) / "capture"
-        (folder / MODEL / "0").mkdir(parents=True)
+        (folder / "sparse/0").mkdir(parents=True)
+        linked = {entry.name: entry for entry in scene.iterdir() if LINKED.fullmatch(entry.name) and entry.is_dir()}
         try:
-            for name, source in _photo_folders(scene, capture).items():
+            for name, source in ({"images": capture.photo_folder} | linked).items():
                 (folder / name).symlink_to(source.resolve(), target_is_directory=True)
-            write_whole(_reconstruction(*found, capture, refined), folder / MODEL / "0", out)
+            write_whole(_reconstruction(*found, capture, refined), folder / "sparse/0", out)
         except OSError as error:
             raise InputError(
                 f"--out '{out}' cannot be written: make room there, or choose a disk that takes links"
@@ -115,10 +116,3 @@ def _reconstruction(model: Path, suffix: str, capture: Capture, refined: Refinem
         new.add_point3D_with_id(number, point)
     new.update_point_3d_errors()
     return new
-
-
-def _photo_folders(scene: Path, capture: Capture) -> dict[str, Path]:
-    """The folders of photos, of their reduced copies and of masks, by the names that they get in the new capture."""
-    kept = re.compile(rf"({PHOTOS}|{MASKS})(_\d+)?")
-    found = {entry.name: entry for entry in scene.iterdir() if kept.fullmatch(entry.name) and entry.is_dir()}
-    return {PHOTOS: capture.photo_folder} | found

@@ -127,13 +127,13 @@ def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) 
     width, height = (cameras.sizes[0] // 2 * 2).tolist()
     cameras = cameras.to(gaussians.device)
     options = {"fps": RATE, "codec": CODEC, "quality": QUALITY, "macro_block_size": 1, "ffmpeg_log_level": "error"}
-    told = {"console": Console(stderr=True), "disable": not sys.stderr.isatty()}
+    frames = track(range(len(cameras)), "frames", console=Console(stderr=True), disable=not sys.stderr.isatty())
     with tempfile.TemporaryDirectory(dir=video.parent, prefix=".") as hidden:
         temporary = Path(hidden) / video.name  # ffmpeg knows the container by the suffix
         try:
             with closing(imageio_ffmpeg.write_frames(str(temporary), (width, height), **options)) as writer:
                 writer.send(None)
-                for frame in track(range(len(cameras)), "frames", **told):
+                for frame in frames:
                     image = render_image(gaussians, cameras, frame, **look.options)
                     writer.send(np.ascontiguousarray(to_uint8(image.colors)[:height, :width]))
             temporary.replace(video)

@@ -11,7 +11,7 @@ import torch
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
-from turbogs_plugin.model.similarity import in_capture, rounding
+from turbogs_plugin.model.similarity import Similarity, in_capture, placed, rounding
 from turbogs_plugin.model.torch_file import BANDS
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.ply import read_vertices
@@ -89,6 +89,11 @@ def read_ply(path: Path) -> Gaussians:
         opacities = torch.logit(torch.sigmoid(opacities) * (scales - wider).sum(dim=1).exp())
         scales = wider
     return Gaussians(means, quats, scales, opacities, sh0[:, None], shN.reshape(count, 3, rest // 3).mT)
+
+
+def load_ply(path: Path, frame: Frame | None = None) -> Gaussians:
+    """The model of `read_ply` as training and rendering take it (`placed`), in a frame of the file's coordinates."""
+    return placed(read_ply(path), Similarity.into(frame or Frame(np.zeros(3), 1.0)), path)
 
 
 def is_antialiased_ply(path: Path) -> bool:

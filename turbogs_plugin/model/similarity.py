@@ -69,7 +69,7 @@ class Similarity:
         return replace(gaussians, means=means, scales=gaussians.scales + math.log(self.scale))
 
 
-def placed(gaussians: Gaussians, change: Similarity, source: Path) -> Gaussians:
+def placed(gaussians: Gaussians, change: Similarity, source: str | Path) -> Gaussians:
     """A file's model (float64), changed, as training and rendering take it: float32, on the CPU.
 
     Infinite opacities and scales of 0 become finite; Gaussians that are not finite are left out. Warnings about the
@@ -114,7 +114,7 @@ def rounding(frame: Frame) -> float:
     return float(np.abs(frame.center).max() * np.finfo(np.float32).eps / 2 / frame.scale)
 
 
-def _finite(gaussians: Gaussians, file: Path) -> Gaussians:
+def _finite(gaussians: Gaussians, file: str | Path) -> Gaussians:
     """The Gaussians of which every number is finite, with a warning that counts the others. Raises `InputError` where
     there is none."""
     finite = gaussians.finite_rows()

@@ -23,10 +23,11 @@ from turbogs_plugin.viewer.server import POLL_SECONDS, Page, serve_until_interru
 class LiveViewer(Listener):
     """Shows a training on a page with its controls, and waits where the page asks for it."""
 
+    trainer: Trainer
+    _capture: CaptureViews
+
     def __init__(self, page: Page) -> None:
         self.page = page
-        self.trainer: Trainer | None = None
-        self._capture: CaptureViews | None = None
         self._samples: PixelSamples | None = None
         self._psnr = math.nan
 
@@ -43,7 +44,7 @@ class LiveViewer(Listener):
         if self.page.paused:
             self._hold(loop)
         elif self.page.watched:
-            self._serve(loop.trainer, running=True)
+            self._serve(running=True)
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         self._psnr = evaluation.psnr
@@ -53,10 +54,8 @@ class LiveViewer(Listener):
 
     def stay(self) -> None:
         """Show the model after the training until Ctrl-C."""
-        trainer = self.trainer
-        assert trainer is not None, "no training was watched"
         self.page.training.visible = False
-        serve_until_interrupted(self.page, lambda: self._serve(trainer, running=False))
+        serve_until_interrupted(self.page, lambda: self._serve(running=False))
 
     def _hold(self, loop: TrainingLoop) -> None:
         """Wait until the page asks for an iteration or lets the training go on, or the training is to be stopped.
@@ -65,33 +64,22 @@ class LiveViewer(Listener):
             while self.page.paused and not loop.stopped:
                 if not self.page.watched:
                     self.page.pause(False)
-                drawn = self._serve(loop.trainer, running=False)
+                drawn = self._serve(running=False)
                 if self.page.steps.acquire(timeout=0.0 if drawn else POLL_SECONDS):
                     break
 
-    def _serve(self, trainer: Trainer, running: bool) -> bool:
+    def _serve(self, running: bool) -> bool:
         """Draw a frame if one is due, and say what it shows."""
-
-        def state() -> ModelState:
-            synchronize(trainer.device)  # waiting for the iterations before is no cost of a frame
-            return self._state(trainer)
-
-        drawn = self.page.frames.serve(state, trainer.iteration, running)
+        drawn = self.page.frames.serve(self._state, self.trainer.iteration, running)
         if drawn:
-            self.page.say(self._status(trainer, running))
+            doing = "" if running else " (paused)" if self.page.paused else " (finished)"
+            psnr = "" if math.isnan(self._psnr) else f" · test PSNR {self._psnr:.2f} dB"
+            line = f"iteration **{self.trainer.iteration}** of {self.trainer.iterations}{doing}"
+            self.page.say(f"{line} · {len(self.trainer.gaussians):,} Gaussians{psnr}")
         return drawn
 
-    def _state(self, trainer: Trainer) -> ModelState:
-        return ModelState(
-            gaussians=trainer.gaussians,
-            look=Look(trainer.sh_degree, trainer.config.raster, trainer.background.evaluated),
-            capture=self._capture,
-            maps=(trainer.maps, trainer.now),
-            samples=self._samples,
-        )
-
-    def _status(self, trainer: Trainer, running: bool) -> str:
-        doing = "" if running else " (paused)" if self.page.paused else " (finished)"
-        psnr = "" if math.isnan(self._psnr) else f" · test PSNR {self._psnr:.2f} dB"
-        line = f"iteration **{trainer.iteration}** of {trainer.iterations}{doing}"
-        return f"{line} · {len(trainer.gaussians):,} Gaussians{psnr}"
+    def _state(self) -> ModelState:
+        trainer = self.trainer
+        synchronize(trainer.device)  # waiting for the iterations before is no cost of a frame
+        look = Look(trainer.sh_degree, trainer.config.raster, trainer.background.evaluated)
+        return ModelState(trainer.gaussians, look, self._capture, (trainer.maps, trainer.now), self._samples)
