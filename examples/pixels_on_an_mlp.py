@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
-from image_fitting import ImageNetwork, places_of
 from PIL import Image, ImageDraw
 from torch import Tensor
 
@@ -22,6 +21,39 @@ from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 from turbogs_plugin.strategies.protocols import PixelSampler
 from turbogs_plugin.types import PixelSamples, Step
+
+
+class ImageNetwork(torch.nn.Module):
+    """(image, x, y) -> colour: random Fourier features and two hidden layers.
+
+    Args:
+        images: number of images.
+        features: number of waves. width: of the hidden layers.
+        frequency: deviation of the waves' numbers, in radians per side of the image.
+    """
+
+    def __init__(self, images: int, features: int = 64, width: int = 64, frequency: float = 20.0) -> None:
+        super().__init__()
+        self.register_buffer("waves", frequency * torch.randn(2, features))
+        self.embedding = torch.nn.Embedding(images, 16)
+        self.layers = torch.nn.Sequential(
+            torch.nn.Linear(2 * features + 16, width),
+            torch.nn.ReLU(),
+            torch.nn.Linear(width, width),
+            torch.nn.ReLU(),
+            torch.nn.Linear(width, 3),
+        )
+
+    def forward(self, images: Tensor, places: Tensor) -> Tensor:
+        """`images`: [P] int64; `places`: [P, 2], 0 .. 1. Returns [P, 3]."""
+        phases = places @ self.waves
+        return self.layers(torch.cat([phases.sin(), phases.cos(), self.embedding(images)], dim=-1))
+
+
+def places_of(samples: PixelSamples) -> Tensor:
+    """[P, 2] pixel centres as fractions of the image."""
+    sizes = torch.as_tensor(samples.sizes)[samples.view_of_slot()]  # [P, 2]
+    return (samples.coordinates() + 0.5) / sizes
 
 
 @dataclass

@@ -9,6 +9,7 @@ import math
 import re
 import shutil
 import sys
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -74,9 +75,11 @@ def test_sparse_pixels_draws_by_errors_from_the_first_step_on(example, capture):
         torch.testing.assert_close(maps.errors[start:end].cpu(), expected)
 
 
-def test_image_fitting(example):
-    fitting = example("image_fitting")
-    assert fitting.main(iterations=60) > fitting.main(iterations=1) + 3
+def test_the_loop_without_a_trainer_is_the_page_s_and_learns(example, capture):
+    loop, page = example("plain_loop"), (EXAMPLES.parent / "docs" / "drop-in.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(samples = sampler.*?density.apply.*?)^```$", page, re.DOTALL | re.MULTILINE)
+    assert textwrap.indent(block, " " * 8) in (EXAMPLES / "plain_loop.py").read_text(encoding="utf-8")
+    assert loop.main(str(capture), iterations=40) > loop.main(str(capture), iterations=8) + 1
 
 
 def test_pixels_on_an_mlp(example, tmp_path, capsys):

@@ -9,9 +9,9 @@ import tyro
 from gsplat import DefaultStrategy, MCMCStrategy
 from helpers.bridge_host import Host, arguments, make_splats
 from helpers.optimizers import equal
+from helpers.refusals import assert_refused
 
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import TurboDensityStrategy, apply_row_update, sparse_rasterization
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 from turbogs_plugin.model.row_order import in_order_of_space
@@ -78,7 +78,7 @@ def test_the_state_has_the_statistics_of_each_step_once():
         torch.testing.assert_close(host.state[name], expected, msg=lambda text, name=name: f"{name}: {text}")
 
 
-def test_schedule_events_happen_where_gsplats_do(monkeypatch):
+def test_schedule_events_happen_where_gsplats_do():
     events = {}
     for cls in (DefaultStrategy, TurboDensityStrategy):
         host = Host(cls(refine_start_iter=3, refine_every=3, refine_stop_iter=12, grow_grad2d=1e-9))
@@ -222,60 +222,39 @@ def test_parameters_of_a_host_of_its_own_follow():
     assert len(splats["means"]) == len(splats["features"]) > 40
 
 
-def test_what_is_missing_is_named():
+def test_what_does_not_fit_is_refused_by_name():
     host = Host(TurboDensityStrategy(**SOON))
-    common = (host.splats, host.optimizers)
-    with pytest.raises(InputError, match=r"info has no 'means2d'"):
-        host.strategy.step_pre_backward(*common, host.state, 0, {})
+    post, common = host.strategy.step_post_backward, (host.splats, host.optimizers)
+    assert_refused("info has no 'means2d'", host.strategy.step_pre_backward, *common, host.state, 0, {})
+    for operation in (host.strategy._update_state, host.strategy._grow_gs, host.strategy._prune_gs):
+        assert_refused("call step_post_backward of TurboDensityStrategy", operation, {}, {}, {}, 0, packed=False)
     host.step(0)
-    with pytest.raises(InputError, match=r"the state has no 'driven_by', .*initialize_state"):
-        host.strategy.step_post_backward(*common, DefaultStrategy().initialize_state(), 0, host.info)
-    with pytest.raises(InputError, match=r"'opacities' has shape \(40, 2\): expected \[N\] with N = 40"):
-        bad = {**host.splats, "opacities": torch.nn.Parameter(torch.zeros(40, 2))}
-        host.strategy.step_post_backward(bad, host.optimizers, host.state, 0, host.info)
-    host.info["means2d"].grad = None
-    with pytest.raises(InputError, match=r"means2d'\] has no gradient"):
-        host.strategy.step_post_backward(*common, host.state, 0, host.info)
+    theirs, given = DefaultStrategy().initialize_state(), (host.state, 0, host.info)
+    assert_refused("the state has no 'driven_by', .*initialize_state", post, *common, theirs, 0, host.info)
+    words = r"'opacities' has shape \(40, 2\): expected \[N\] with N = 40"
+    assert_refused(words, post, {**host.splats, "opacities": torch.zeros(40, 2)}, {}, *given)
+    host.tells_errors = True
+    assert_refused("was gradient-driven, now error-driven", host.step, 1)
+    absgrad = host.info["means2d"].absgrad
+    del host.info["means2d"].absgrad
+    state = host.strategy.initialize_state()
+    assert_refused("no absgrad: render with absgrad=True", post, *common, state, 1, host.info)
+    host.info["means2d"].absgrad, host.info["means2d"].grad = absgrad, None
+    assert_refused(r"means2d'\] has no gradient", post, *common, state, 1, host.info)
+    host.tells_errors, host.state["grad_sums"] = False, host.state["grad_sums"][:7]
+    assert_refused(r"state\['grad_sums'\] has 7 rows, the parameters 40", host.step, 1)
+    for name, value in {"revised_opacity": True, "key_for_gradient": "x", "top_fraction": 0.0}.items():
+        assert_refused(name, TurboDensityStrategy, **{name: value})
+    assert Host(TurboDensityStrategy(**SOON, absgrad=False)).train(4)
 
 
 @pytest.mark.parametrize("tells_errors", [False, True])
 def test_info_of_another_model_is_refused(tells_errors):
     host = Host(TurboDensityStrategy(**SOON), tells_errors=tells_errors)
     host.step(0)
-    other = {name: torch.nn.Parameter(value.detach()[:7]) for name, value in host.splats.items()}
-    with pytest.raises(InputError, match=r"info is of 40 Gaussians, the parameters are 7: pass the info of this step"):
-        host.strategy.step_post_backward(other, host.optimizers, host.strategy.initialize_state(), 1, host.info)
-
-
-def test_changes_in_mid_run_are_refused():
-    host = Host(TurboDensityStrategy(**SOON))
-    host.step(0)
-    host.tells_errors = True
-    with pytest.raises(InputError, match="was gradient-driven, now error-driven"):
-        host.step(1)
-    host = Host(TurboDensityStrategy(**SOON))
-    host.step(0)
-    host.state["grad_sums"] = host.state["grad_sums"][:7]
-    with pytest.raises(InputError, match=r"state\['grad_sums'\] has 7 rows, the parameters 40"):
-        host.step(1)
-
-
-def test_absgrad_must_be_there_or_off():
-    host = Host(TurboDensityStrategy(**SOON))
-    host.step(0)
-    del host.info["means2d"].absgrad
-    with pytest.raises(InputError, match="no absgrad: render with absgrad=True"):
-        host.strategy.step_post_backward(host.splats, host.optimizers, host.state, 1, host.info)
-    assert Host(TurboDensityStrategy(**SOON, absgrad=False)).train(4)
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("revised_opacity", True), ("key_for_gradient", "x"), ("top_fraction", 0.0)],
-)
-def test_invalid_fields_are_refused(field, value):
-    with pytest.raises(InputError, match=field):
-        TurboDensityStrategy(**{field: value})
+    other, state = {name: value.detach()[:7] for name, value in host.splats.items()}, host.strategy.initialize_state()
+    words = "info is of 40 Gaussians, the parameters are 7: pass the info of this step"
+    assert_refused(words, host.strategy.step_post_backward, other, host.optimizers, state, 1, host.info)
 
 
 def test_a_pause_after_resets_is_no_matter():
@@ -335,13 +314,6 @@ def test_several_renders_a_step(together):
         if step == 0:
             assert float(host.state["view_counts"].max()) == 2 * 3  # renders times cameras
     assert len(host.splats["means"]) > 40
-
-
-def test_private_operations_of_gsplats_strategy_are_refused_by_name():
-    strategy = TurboDensityStrategy()
-    for operation in (strategy._update_state, strategy._grow_gs, strategy._prune_gs):
-        with pytest.raises(InputError, match="call step_post_backward of TurboDensityStrategy"):
-            operation({}, {}, {}, 0, packed=False)
 
 
 def test_the_step_where_gsplat_does_not_refine_yet_keeps_the_window():

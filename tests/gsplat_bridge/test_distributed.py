@@ -2,13 +2,12 @@
 
 from contextlib import contextmanager
 
-import pytest
 import torch
 from helpers.bridge_host import Host
+from helpers.refusals import assert_refused
 from torch import distributed
 from torch.testing._internal.distributed.fake_pg import FakeStore
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
 
@@ -36,17 +35,10 @@ def test_several_processes_are_refused_by_name():
     host.step(0)
     for value in host.splats.values():
         value.grad = torch.ones_like(value)
-    given = (host.splats, host.optimizers, host.state, 1, host.info)
-    refused = {
-        "TurboDensityStrategy": [host.strategy.step_pre_backward, host.strategy.step_post_backward],
-        "SharedOptimizer": [
-            lambda *_: SharedOptimizer(SparseAdam())([{"params": host.splats["means"], "name": "means"}]),
-            lambda *_: [member.step() for member in host.optimizers.values()],
-        ],
-        "sparse_rasterization": [lambda *_: host.step(1)],
-    }
+    given, group = (host.splats, host.optimizers, host.state, 1, host.info), {"params": host.splats["means"]}
     with process_group(2):
-        for swap, uses in refused.items():
-            for use in uses:
-                with pytest.raises(InputError, match=f"^{swap} works in one process, this process group has 2: "):
-                    use(*given)
+        for hook in (host.strategy.step_pre_backward, host.strategy.step_post_backward):
+            assert_refused("^TurboDensityStrategy works in one process, this process group has 2: ", hook, *given)
+        assert_refused("^SharedOptimizer works", SharedOptimizer(SparseAdam()), [group | {"name": "means"}])
+        assert_refused("^SharedOptimizer works", lambda: [each.step() for each in host.optimizers.values()])
+        assert_refused("^sparse_rasterization works", host.step, 1)

@@ -7,8 +7,7 @@ import torch
 from helpers.bridge_host import Host
 from helpers.gsplat_stand_ins import Scene
 
-from turbogs_plugin.gsplat_bridge import TurboDensityStrategy, apply_row_update
-from turbogs_plugin.types import RowUpdate
+from turbogs_plugin.gsplat_bridge import TurboDensityStrategy
 
 SOON = {"refine_start_iter": 2, "refine_every": 3, "refine_stop_iter": 8, "grow_grad2d": 1e-6, "prune_opa": 0.2}
 
@@ -40,15 +39,4 @@ def test_a_scenes_rows_follow(tells_errors):
     tags = scene.splats["tag"].long()
     assert len(tags) > 40 and len(tags.unique()) < 40  # some were copied, some are gone
     assert (tags.diff() < 0).any()  # and all are in another order
-    assert_rows_follow(scene)
-
-
-def test_a_row_update_takes_a_scene_along():
-    host = Host(TurboDensityStrategy())
-    host.step(0)
-    scene = with_scene(host)
-    source = torch.tensor([5, 0, 7, 7, 39])
-    update = RowUpdate(source, torch.tensor([False, False, False, True, True]), {})
-    apply_row_update(update, host.splats, host.optimizers, host.state, scene)
-    assert scene.signal["tag"].tolist() == [5, 0, 7, 7, 39]
     assert_rows_follow(scene)

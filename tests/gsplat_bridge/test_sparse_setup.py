@@ -1,12 +1,13 @@
 """Views, rate and maps that the sparse swap starts with."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from helpers.refusals import assert_refused
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import maps_of_photos, sparse_budget
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.types import SamplingBudget, Step
@@ -29,17 +30,18 @@ def test_a_step_has_the_pixels_of_an_image_and_it_says_so(num_views, batch_size,
     assert f"sparse_budget: {expected.views} views a step, {expected.rate:.0%} of the pixels" in line and given in line
 
 
-@pytest.mark.parametrize(("name", "value"), [("use_bilateral_grid", True), ("post_processing", "ppisp")])
-def test_options_that_need_whole_images_are_refused_by_name(name, value):
-    config = type("Config", (), {name: value})
-    with pytest.raises(InputError, match=f"{name}={value!r} does not work with sparse pixels"):
-        sparse_budget(5, 1, config)
-
-
-@pytest.mark.parametrize(("arguments", "name"), [((0,), "num_views"), ((5, 0), "batch_size"), ((5, 6), "batch_size")])
-def test_impossible_numbers_are_refused(arguments, name):
-    with pytest.raises(InputError, match=name):
-        sparse_budget(*arguments)
+@pytest.mark.parametrize(
+    ("words", "given"),
+    [
+        ("use_bilateral_grid=True does not work with sparse pixels", (5, 1, SimpleNamespace(use_bilateral_grid=True))),
+        ("post_processing='ppisp' does not work", (5, 1, SimpleNamespace(post_processing="ppisp"))),
+        ("num_views = 0", (0,)),
+        ("batch_size = 0", (5, 0)),
+        ("batch_size = 6", (5, 6)),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(words, given):
+    assert_refused(words, sparse_budget, *given)
 
 
 @dataclass
@@ -84,16 +86,13 @@ def test_masks_of_a_trainset_are_heeded(of_first):
     assert maps.view_means()[0] == pytest.approx(float((images[0].sum(dim=-1) / 255)[mask].mean()), rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("image", "found"),
-    [
-        (torch.zeros(20, 30, 4), r"\(20, 30, 4\)"),  # RGBA
-        (np.zeros((20, 30, 3)), "ndarray"),
-    ],
-)
-def test_what_is_no_image_of_three_colours_is_refused_by_name(image, found):
-    trainset = [{"image": torch.zeros(20, 30, 3)}, {"image": image}]
-    with pytest.raises(InputError, match=rf"^trainset\[1\]\['image'\] is {found}: expected a tensor \[H, W, 3\]"):
-        maps_of_photos(trainset)
-    with pytest.raises(InputError, match=r"trainset needs whole images, its patch_size is 8"):
-        maps_of_photos(Photos(torch.zeros(2, 8, 8, 3), patch_size=8))
+@pytest.mark.parametrize("image", [torch.zeros(20, 30, 4), np.zeros((20, 30, 3))], ids=["RGBA", "numpy"])
+def test_what_is_no_image_of_three_colours_is_refused_by_name(image):
+    found = "ndarray" if isinstance(image, np.ndarray) else r"\(20, 30, 4\)"
+    words = rf"^trainset\[1\]\['image'\] is {found}: expected a tensor \[H, W, 3\]"
+    assert_refused(words, maps_of_photos, [{"image": torch.zeros(20, 30, 3)}, {"image": image}])
+
+
+def test_a_data_set_of_patches_is_refused():
+    patches = Photos(torch.zeros(2, 8, 8, 3), patch_size=8)
+    assert_refused("trainset needs whole images, its patch_size is 8", maps_of_photos, patches)

@@ -17,8 +17,7 @@ from gsplat import DefaultStrategy
 from helpers.bridge_host import HEIGHT, RATES, WIDTH, arguments, make_cameras, make_splats
 
 from turbogs_plugin.engine.render import dense_samples
-from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, TurboStep, sparse_rasterization
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.gsplat_bridge import TurboDensityStrategy, TurboStep, sparse_rasterization
 
 DROP_IN = Path(__file__).resolve().parents[2] / "docs" / "drop-in.md"
 OURS = {"features_dc": "sh0", "features_rest": "shN"}
@@ -150,24 +149,3 @@ def test_splatfacto_trains_with_the_recipe(recipe, capsys):
         (group,) = model.optimizers[name].param_groups
         assert parameter.shape == (count, *shapes[name]) and group["params"][0] is parameter
         assert model.optimizers[name].state[parameter]["exp_avg"].shape == parameter.shape
-
-
-def test_both_layouts_take_the_same_steps():
-    """One update of LM with errors: flat parameters move as gsplat's do."""
-    results = []
-    for flat in (False, True):
-        splats, shared = make_splats(), SharedOptimizer(MomentLMOptimizer())
-        values = {name: value.detach().clone() for name, value in splats.items()}
-        if flat:
-            values["sh0"], values["opacities"] = values["sh0"][:, 0], values["opacities"][:, None]
-        params = {name: torch.nn.Parameter(value) for name, value in values.items()}
-        members = [shared([{"params": [value], "lr": 0.01, "name": name}]) for name, value in params.items()]
-        for step in range(3):
-            for name, value in params.items():
-                generator = torch.Generator().manual_seed(step)
-                value.grad = torch.randn(splats[name].shape, generator=generator).reshape(value.shape)
-            for member in members:
-                member.step()
-        results.append({name: value.detach().reshape(splats[name].shape) for name, value in params.items()})
-    for name in results[0]:
-        torch.testing.assert_close(results[1][name], results[0][name], rtol=0, atol=0)

@@ -135,7 +135,8 @@ def sparse_rasterization(
 def _check_options(options: dict[str, Any]) -> None:
     for name, value in options.items():
         if name not in _ONLY:
-            raise InputError(f"sparse_rasterization has no option '{name}': {nearest(name, _ONLY)}")
+            hint = nearest(name, _ONLY).partition(" (")[0]  # without the thirty known ones
+            raise InputError(f"sparse_rasterization has no option '{name}': {hint}")
         if value is not None and (isinstance(value, Tensor) or value != _ONLY[name]):
             found = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)
             raise InputError(f"sparse_rasterization: {name}={found} is not supported, only {_ONLY[name]!r}")
