@@ -104,13 +104,10 @@ def test_a_broken_entry_point_is_named(plug_in, value):
         build("pixel_sampler", {"type": "few"})
 
 
-@pytest.mark.parametrize(
-    ("source", "reason"),
-    [("import sys; sys.exit(0)", "SystemExit"), ("raise RuntimeError('two\\nlines')", "RuntimeError: two lines")],
-)
-def test_a_module_that_breaks_as_it_is_imported_is_named(source, reason):
+@pytest.mark.parametrize("source", ["import sys; sys.exit('two\\nlines')", "raise RuntimeError('two\\nlines')"])
+def test_a_module_that_breaks_as_it_is_imported_is_named(source):
     Path("breaking.py").write_text(source)
-    with pytest.raises(InputError, match=f"breaking:X.*cannot be imported: {reason}"):
+    with pytest.raises(InputError, match=r"breaking:X.*cannot be imported: (SystemExit|RuntimeError): two lines$"):
         build("pixel_sampler", {"type": "breaking:X"})
 
 
@@ -174,12 +171,9 @@ def test_an_installed_module_of_a_run_needs_no_trust(shared_run, monkeypatch, tm
     assert shared_run.read_config(built=True).density["opacity_decay"] == 0.2
 
 
-def test_a_class_that_does_not_inherit_has_the_defaults_of_its_protocol():
+def test_a_class_that_does_not_inherit_has_the_defaults_of_its_protocol_and_its_decay_is_scaled():
     assert build("pixel_sampler", {"type": "third_party:MySampler"}).heeds_masks is False
     assert build("loss", {"type": "third_party:MyLoss"}).terms is None
-
-
-def test_a_decay_without_an_interval_may_be_scaled():
     config = load_config("turbogs", ["density.type=third_party:Fading"])
     assert with_iterations(config, 500).density == {"type": "third_party:Fading", "opacity_decay": 0.2}
 

@@ -15,8 +15,6 @@ from turbogs_plugin.plan import SceneFacts
 from turbogs_plugin.plan.decisions import RULES, plan_from_facts
 from turbogs_plugin.plan.photo_gains import PhotoGains
 from turbogs_plugin.report.run_report import write_report
-from turbogs_plugin.study import cell as cell_module
-from turbogs_plugin.study.results import StudyFolder
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.yaml_json import parse_yaml
@@ -196,21 +194,3 @@ def test_a_planned_run_tells_its_plan_and_does_not_plan_again(turbogs, capture, 
     monkeypatch.setattr(run, "make_plan", None)  # a resumed run must not plan again
     run.resume(stopped, write_report)
     assert "of 7 photos could be compared" in (stopped / "report.md").read_text()
-
-
-def test_the_ablation_of_leave_outs_plans_each_cell(turbogs, capture, tmp_path, monkeypatch):
-    """Forced both ways; where things are changes no result."""
-    monkeypatch.setattr(cell_module, "warm_up", lambda *arguments: None)
-    variants = ["all-views", "no-ncc", "host-pixels"]
-    options = ["--steps", 4, "--device", "cpu", "--scene", capture, "--out", tmp_path / "study"]
-    code, _, err = turbogs("ablate", "leave_out", "train.evaluate_at=[]", *options, "--only", *variants)
-    assert code == 0, err
-    cells = {cell.variant: cell for cell in StudyFolder(tmp_path / "study").read_study().results}
-    measures = ("psnr", "worst_psnr", "ssim", "l1", "gaussians")
-    final = {name: [cell.final.get(measure) for measure in measures] for name, cell in cells.items()}
-    assert set(final) == {"nothing", *variants}
-    assert final["host-pixels"] == final["nothing"]
-    assert len({final[name][0] for name in ("nothing", "all-views", "no-ncc")}) == 3
-    cell = cells["nothing"]
-    assert cell.planned["train.pixels_place"] == "device" and not [key for key in cell.planned if "optimizer" in key]
-    assert cell.settings["train.pixels_place"] == "auto", "what was asked for is kept, so that a call can go on"
