@@ -22,7 +22,6 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.renders import distinct_stems
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.train import inputs, run
-from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("plotted")
 
@@ -89,9 +88,8 @@ def test_cuda_asked_for_and_absent(turbogs, capture, finished, tmp_path, monkeyp
     if not words:
         stopped = Path(shutil.copytree(finished, tmp_path / "stopped"))
         (stopped / "report.md").unlink()
-        (stopped / "config.yaml").write_text(
-            (stopped / "config.yaml").read_text().replace("device: cpu", "device: cuda")
-        )
+        file = stopped / "config.yaml"
+        file.write_text(file.read_text().replace("device: cpu", "device: cuda"))
         call = ["train", "--resume", stopped]
     assert_refused(turbogs(*call), "CUDA", "turbogs doctor", "--device cpu")
     assert not (tmp_path / "run").exists()
@@ -131,16 +129,11 @@ def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch):
     assert_refused(turbogs("demo", tmp_path / "demo"), "the system says: No space left on device; choose another")
 
 
-OPTIONS = "--config demo --device cpu"
-
-
-@pytest.mark.parametrize(
-    "order", [f"SCENE train.seed=5 {OPTIONS}", f"SCENE {OPTIONS} train.seed=5", f"{OPTIONS} SCENE"]
-)
+@pytest.mark.parametrize("order", ["SCENE train.seed=5 OPTIONS", "SCENE OPTIONS train.seed=5", "OPTIONS SCENE"])
 def test_overrides_stand_anywhere(turbogs, capture, monkeypatch, order):
-    seen = []
+    seen, words = [], order.replace("SCENE", str(capture)).replace("OPTIONS", "--config demo --device cpu").split()
     monkeypatch.setattr(run, "plan_run", lambda config, count: seen.append(config.train) or SimpleNamespace(text=str))
-    code, _, error = turbogs("plan", *order.replace("SCENE", str(capture)).split(), "train.iterations=7")
+    code, _, error = turbogs("plan", *words, "train.iterations=7")
     assert code == 0, error
     assert [(train.seed, train.iterations) for train in seen] == [(5 if "seed" in order else 0, 7)]
 
@@ -197,8 +190,8 @@ def test_a_run_without_or_with_a_broken_checkpoint(turbogs, finished, tmp_path):
     broken = Path(shutil.copytree(finished, tmp_path / "broken"))
     checkpoint = next((broken / "checkpoints").glob("*.pt"))
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
-    for arguments in (["eval", broken], ["export", broken]):
-        assert_refused(turbogs(*arguments), "cannot be used", checkpoint.name)
+    for verb in ("eval", "export"):
+        assert_refused(turbogs(verb, broken), "cannot be used", checkpoint.name)
     shutil.rmtree(broken / "checkpoints")
     before = tree(broken)
     for verb in ("eval", "render", "export"):
@@ -267,13 +260,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypa
 
 
 def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(turbogs, capture, tmp_path, monkeypatch):
-    step = Trainer.step
-
-    def spoiled(trainer):
-        step(trainer)
-        trainer.gaussians.opacities[:] = torch.inf
-
-    monkeypatch.setattr(Trainer, "step", spoiled)
+    stop_after(monkeypatch, 2, lambda trainer: trainer.gaussians.opacities.fill_(torch.inf))
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *QUICK)
     errors = [line for line in err.splitlines() if line.startswith("turbogs: error:")]
     assert code == 1 and out == "" and len(errors) == 1 and "not finite" in errors[0]

@@ -129,14 +129,11 @@ def test_a_json_file_is_refused_before_it_is_read(tmp_path, read):
 
 
 def test_a_base_is_looked_for_beside_its_file(write, tmp_path, monkeypatch):
-    (tmp_path / "common").mkdir()
-    (tmp_path / "common/seed.yaml").write_text("base: turbogs\ntrain: {seed: 7}\n")
-    file = write("base: common/seed.yaml\nmaps: {beta: 0.9}\n")
-    elsewhere = tmp_path / "elsewhere"
-    (elsewhere / "common").mkdir(parents=True)
-    (elsewhere / "common/seed.yaml").write_text("base: turbogs\ntrain: {seed: 8}\n")
-    monkeypatch.chdir(elsewhere)
-    config = load_config(file)
+    for seed, folder in ((7, "common"), (8, "elsewhere/common")):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "seed.yaml").write_text(f"base: turbogs\ntrain: {{seed: {seed}}}\n")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    config = load_config(write("base: common/seed.yaml\nmaps: {beta: 0.9}\n"))
     assert (config.train.seed, config.maps.beta) == (7, 0.9)
     with pytest.raises(InputError, match="unknown config 'turbgos': did you mean 'turbogs'"):
         load_config(write("base: turbgos\n"))
