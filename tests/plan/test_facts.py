@@ -6,23 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from turbogs_plugin.captures import load_scene
 from turbogs_plugin.plan import gather_facts
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.photos import Photos
+from turbogs_plugin.types import Cameras
 
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(scope="module")
-def scene(capture) -> Scene:
-    return load_scene(capture)
 
 
 def of_views(scene: Scene, viewmats: torch.Tensor) -> Scene:
     """The first views of the scene, with other cameras."""
     count, views = len(viewmats), scene.train
-    cameras = replace(views.cameras.select(range(count)), viewmats=viewmats)
+    cameras = Cameras(viewmats, views.cameras.Ks[:count], views.cameras.sizes[:count])
     photos = Photos(views.photos.colors[: count * 40 * 24], views.photos.sizes[:count])
     return replace(scene, train=replace(views, cameras=cameras, names=views.names[:count], photos=photos))
 

@@ -14,7 +14,6 @@ from turbogs_plugin.train import inputs, run
 from turbogs_plugin.train import session as sessions
 from turbogs_plugin.train.clock import WallClock, WallRecord
 
-
 pytestmark = pytest.mark.usefixtures("plotted")
 
 

@@ -19,7 +19,6 @@ from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.look import Look, interpolated_exposures
 from turbogs_plugin.train.metrics import evaluate, render_view
 from turbogs_plugin.train.run import train
-from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("plotted")
 
@@ -37,19 +36,8 @@ def capture(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
-def scene(capture):
-    return load_scene(capture)
-
-
-def trainer_of(scene, *overrides: str) -> Trainer:
-    trainer = tiny_trainer(scene, *overrides)
-    trainer.initialise_maps()
-    return trainer
-
-
 def test_the_dark_photo_gets_a_dark_exposure_and_the_mean_stays_the_identity(scene):
-    trainer = trainer_of(scene, *ON, "train.iterations=60")
+    trainer = tiny_trainer(scene, *ON, "train.iterations=60")
     for _ in range(25):
         trainer.step()
     gains = trainer.exposures.offsets[:, :, :3].diagonal(dim1=1, dim2=2).mean(dim=1)  # [V]
@@ -61,7 +49,7 @@ def test_the_dark_photo_gets_a_dark_exposure_and_the_mean_stays_the_identity(sce
 def test_the_first_iteration_is_that_without_exposures(scene):
     """Until the first step of Adam, every exposure is the identity to the bit."""
     alone = "train.average_last=0"  # the mean has exposures too
-    states = [trainer_of(scene, alone, *overrides) for overrides in ((), ("train.exposure=true",))]
+    states = [tiny_trainer(scene, alone, *overrides) for overrides in ((), ("train.exposure=true",))]
     for trainer in states:
         trainer.step()
     off, on = (trainer.state_dict() for trainer in states)
@@ -72,8 +60,9 @@ def test_the_first_iteration_is_that_without_exposures(scene):
 @pytest.mark.parametrize("loss", ["charbonnier_ncc", "sparse_ssim"])
 def test_a_run_goes_on_bit_for_bit_and_from_host_memory(scene, loss):
     overrides = ("train.exposure=true", f"loss.type={loss}", "schedule.max_views=2")
-    hosted = (*overrides, "train.pixels_place=host")
-    whole, first, second = trainer_of(scene, *overrides), trainer_of(scene, *hosted), trainer_of(scene, *overrides)
+    first, whole, second = (
+        tiny_trainer(scene, *overrides, f"train.pixels_place={place}") for place in ("host", "device", "device")
+    )
     for trainer in 3 * (first, whole, whole):
         trainer.step()
     second.load_state_dict(first.state_dict())
@@ -116,7 +105,7 @@ def mean_of(table: str, column: str) -> float:
 
 def test_test_views_are_shown_with_what_their_neighbours_have(scene):
     """Nothing but exposures changes: the model's own colours have the errors that they had."""
-    trainer = trainer_of(scene, "train.exposure=true")
+    trainer = tiny_trainer(scene, "train.exposure=true")
     views = (trainer.gaussians, scene.test)
     before = evaluate(*views, trainer.look(scene.test.names)).mean
     assert before.psnr == before.own_psnr  # every exposure is the identity
@@ -168,7 +157,7 @@ def test_exposed_is_the_affine_map_of_each_colour():
 
 
 def test_an_iteration_exposes_its_colours_once(scene):
-    trainer = trainer_of(scene, *ON, "maps.beta=1")
+    trainer = tiny_trainer(scene, *ON, "maps.beta=1")
     trainer.exposures.offsets[:] = torch.linspace(-0.3, 0.2, 84).view(7, 3, 4)
     expected, step = [trainer.dense_errors(view) for view in range(7)], trainer.now
     trainer.step()
@@ -179,7 +168,7 @@ def test_an_iteration_exposes_its_colours_once(scene):
 
 
 def test_the_maps_begin_with_each_exposure_applied_once(scene):
-    trainer, view = trainer_of(scene, "train.exposure=true"), DARK
+    trainer, view = tiny_trainer(scene, "train.exposure=true"), DARK
     trainer.exposures.offsets[view] = torch.linspace(-0.3, 0.2, 12).view(3, 4)
     trainer.initialise_maps()
     photo, exposure = trainer.views.photos.image(view), trainer.exposures.offsets[view]

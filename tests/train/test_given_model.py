@@ -15,7 +15,6 @@ from helpers.models import random_gaussians
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.commands.options import GivenOptions
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
@@ -27,7 +26,7 @@ from turbogs_plugin.model.placement import TRANSFORMS, TURNS
 from turbogs_plugin.model.ply import read_ply, save_ply
 from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.model.spz import save_spz
-from turbogs_plugin.scene import Frame, Scene
+from turbogs_plugin.scene import Frame
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.history import read_history
@@ -51,11 +50,6 @@ def finished(capture, tmp_path_factory) -> Path:
 def trained(finished) -> Gaussians:
     """Its model, in the frame of its scene. Not to be changed."""
     return load_model(finished, CPU).gaussians
-
-
-@pytest.fixture(scope="module")
-def scene(capture) -> Scene:
-    return load_scene(capture)
 
 
 @pytest.fixture
@@ -227,46 +221,39 @@ def test_a_model_that_is_larger_than_the_cap_is_refused(finished, scene):
         tiny_trainer(scene, f"train.init={finished}", "density.max_gaussians=100")
 
 
-def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
-    """What -> (a file, words of the answer)."""
-
-    def written(name: str, content: bytes) -> Path:
-        (folder / name).write_bytes(content)
-        return folder / name
-
-    def saved(name: str, value: object) -> Path:
-        torch.save(value, folder / name)
-        return folder / name
-
-    empty = folder / "empty"
-    empty.mkdir()
-    broken = random_gaussians(5).map(lambda value: value * torch.nan)
-    return {
-        "absent": (folder / "absent.ply", "no such model"),
-        "another kind": (written("model.obj", b"x"), "a .ply, .spz or gsplat's .pt"),
-        "empty folder": (empty, "without a checkpoint of a run"),
-        "other keys": (saved("weights.pt", {"conv1": torch.zeros(3), "bias": torch.zeros(1)}), "bias, conv1"),
-        "code": (saved("code.pt", {"splats": Path("x")}), "more than plain tensors"),
-        "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
-        "PlayCanvas's": (written("m.sog", b"x"), "splat-transform"),
-        "nerfstudio's": (written("m.ckpt", b"x"), "ns-export"),
-        "Inria's": (written("m.pth", b"x"), "point_cloud.ply"),
-        "not a spz": (written("text.spz", b"text"), "cannot read"),
-    }
+BAD_FILES = {
+    "absent.ply": (None, "no such model"),
+    "model.obj": (b"x", "a .ply, .spz or gsplat's .pt"),
+    "empty": ("a folder", "without a checkpoint of a run"),
+    "weights.pt": ({"conv1": torch.zeros(3), "bias": torch.zeros(1)}, "bias, conv1"),
+    "code.pt": ({"splats": Path("x")}, "more than plain tensors"),
+    "nan.pt": ({"splats": dict(random_gaussians(5).map(lambda value: value * torch.nan).items())}, "none of its 5"),
+    "m.sog": (b"x", "splat-transform"),
+    "m.ckpt": (b"x", "ns-export"),
+    "m.pth": (b"x", "point_cloud.ply"),
+    "text.spz": (b"text", "cannot read"),
+}
+"""Name -> what is in it, and words of the answer."""
 
 
-def test_what_is_no_model_is_one_line(turbogs, capture, tmp_path):
-    out = tmp_path / "out"
-    for what, (file, words) in bad_files(tmp_path).items():
-        calls = [("eval", file, "--scene", capture)]
-        if what == "absent":
-            calls += [("train", capture, "--init", file, "--out", out)]
-            calls += [(verb, file, "--scene", capture, "--out", f"{out}.ply") for verb in ("render", "export")]
-        for call in calls:
-            code, printed, error = turbogs(*call)
-            assert code == 2 and printed == "" and error.count("\n") == 1, (what, call[0], error)
-            assert words in error and str(file) in error, (what, error)
-            assert not list(tmp_path.glob("out*"))
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_what_is_no_model_is_one_line(turbogs, capture, tmp_path, name):
+    (content, words), file, out = BAD_FILES[name], tmp_path / name, tmp_path / "out"
+    if isinstance(content, bytes):
+        file.write_bytes(content)
+    elif content == "a folder":
+        file.mkdir()
+    elif content is not None:
+        torch.save(content, file)
+    calls = [("eval", file, "--scene", capture)]
+    if content is None:
+        calls += [("train", capture, "--init", file, "--out", out)]
+        calls += [(verb, file, "--scene", capture, "--out", f"{out}.ply") for verb in ("render", "export")]
+    for call in calls:
+        code, printed, error = turbogs(*call)
+        assert code == 2 and printed == "" and error.count("\n") == 1, (call[0], error)
+        assert words in error and str(file) in error
+        assert not list(tmp_path.glob("out*"))
 
 
 @pytest.mark.parametrize(("shift", "refused"), [(0.0, False), (100.0, True)])
