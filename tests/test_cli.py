@@ -260,7 +260,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypa
 
 
 def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(turbogs, capture, tmp_path, monkeypatch):
-    stop_after(monkeypatch, 2, lambda trainer: trainer.gaussians.opacities.fill_(torch.inf))
+    stop_after(monkeypatch, 1, lambda trainer: trainer.gaussians.opacities.fill_(torch.inf))
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *QUICK)
     errors = [line for line in err.splitlines() if line.startswith("turbogs: error:")]
     assert code == 1 and out == "" and len(errors) == 1 and "not finite" in errors[0]

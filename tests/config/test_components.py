@@ -163,15 +163,12 @@ def test_an_installed_module_of_a_run_needs_no_trust(shared_run, monkeypatch, tm
     assert shared_run.read_config(built=True).density["opacity_decay"] == 0.2
 
 
-def test_a_class_that_does_not_inherit_has_the_defaults_of_its_protocol_and_its_decay_is_scaled():
-    assert build("pixel_sampler", {"type": "third_party:MySampler"}).heeds_masks is False
-    assert build("loss", {"type": "third_party:MyLoss"}).terms is None
-    config = load_config("turbogs", ["density.type=third_party:Fading"])
-    assert with_iterations(config, 500).density == {"type": "third_party:Fading", "opacity_decay": 0.2}
-
-
-def test_a_type_may_be_a_class_in_a_file():
+def test_a_type_may_be_a_class_in_a_file_and_has_the_defaults_of_its_protocol():
     Path("mine.yaml").write_text("base: demo\npixel_sampler: {type: 'third_party:MySampler', share: 0.3}\n")
     from_yaml = load_config("mine.yaml")
     overridden = load_config("demo", ["pixel_sampler.type=third_party:MySampler", "pixel_sampler.share=0.3"])
     assert from_yaml == overridden and from_yaml.build("pixel_sampler").share == 0.3
+    assert from_yaml.build("pixel_sampler").heeds_masks is False
+    assert build("loss", {"type": "third_party:MyLoss"}).terms is None
+    fading = {"type": "third_party:Fading", "opacity_decay": 0.2}  # and no interval
+    assert with_iterations(load_config("turbogs", ["density.type=third_party:Fading"]), 500).density == fading

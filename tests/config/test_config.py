@@ -53,14 +53,11 @@ def test_yaml_over_dataclass_and_override_over_yaml(write):
     assert config.train.sh_degree == 3
 
 
-def test_another_type_starts_its_section_afresh():
+def test_another_type_starts_its_section_afresh_but_for_learning_rates():
     config = load_config("turbogs", ["schedule.pixel_budget=0.5", "schedule.type=fixed"])
     assert config.schedule == {"type": "fixed", "views": 3, "pixel_budget": 0.5}
     same = apply_overrides({"schedule": {"alpha": 2.0}}, ["schedule.type=sinusoidal"])
     assert same == {"schedule": {"alpha": 2.0, "type": "sinusoidal"}}
-
-
-def test_another_type_of_optimizer_keeps_the_learning_rates():
     config = load_config("turbogs", ["optimizer.type=sparse_adam", "optimizer.learning_rates.quats=2e-3"])
     rates = load_config("turbogs").optimizer["learning_rates"]
     assert config.optimizer["learning_rates"] == {**rates, "quats": 2e-3} != rates
@@ -103,7 +100,6 @@ def test_a_bad_override_is_named(override):
         ("train: {seed: 1}\ntrain: {seed: 2}", "not valid YAML.*twice"),
         ("a: " + "[" * (DEPTH_LIMIT + 1), "levels deep"),
         ("a: " + "x" * SIZE_LIMIT, "more than"),
-        ("train: 5", "train: expected a mapping"),
         ("train: {seed: 2001-01-01}", "train.seed: expected a whole number, got '2001-01-01'"),
         ("base: mine.yaml", "circle"),
     ],
@@ -122,10 +118,10 @@ def test_what_is_no_json_is_refused(text):
 
 @pytest.mark.parametrize("read", [read_frames, read_text])
 def test_a_json_file_is_refused_before_it_is_read(tmp_path, read):
-    with open(tmp_path / "transforms.json", "wb") as file:
+    with open(tmp_path / "a.json", "wb") as file:
         file.truncate(2**42)  # which no memory has
-    with pytest.raises(InputError, match=r"transforms\.json has more than 64 MiB: take out what is not needed"):
-        read(tmp_path / "transforms.json")
+    with pytest.raises(InputError, match=r"a\.json has more than 64 MiB: take out what is not needed"):
+        read(tmp_path / "a.json")
 
 
 def test_a_base_is_looked_for_beside_its_file(write, tmp_path, monkeypatch):
@@ -149,12 +145,11 @@ def test_a_text_is_read_back_as_it_was(path):
     assert parse_yaml(yaml_text({"path": path}), "config") == {"path": path}
 
 
-@pytest.mark.parametrize(("content", "message"), [(None, "No such file"), (b"\xff\xfe\x00", "UTF-8")])
-def test_missing_and_binary_files_are_refused(tmp_path, content, message):
-    if content:
-        (tmp_path / "a.yaml").write_bytes(content)
-    with pytest.raises(InputError, match=message):
-        load_config(str(tmp_path / "a.yaml"))
+def test_missing_and_binary_files_are_refused(tmp_path):
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
+    for name, message in (("absent.yaml", "No such file"), ("binary.yaml", "UTF-8")):
+        with pytest.raises(InputError, match=message):
+            load_config(str(tmp_path / name))
 
 
 def test_the_configuration_of_a_run_is_complete():

@@ -8,17 +8,19 @@ import torch
 from helpers.framework_runs import assert_identical, tiny_capture, tiny_config, tiny_trainer
 from PIL import Image
 
-from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.export.renders import render_run
+from turbogs_plugin.plan import facts
+from turbogs_plugin.plan.photo_gains import PhotoGains
 from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.report.run_report import write_report
+from turbogs_plugin.train import training_state
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.look import Look, interpolated_exposures
 from turbogs_plugin.train.metrics import evaluate, render_view
-from turbogs_plugin.train.run import train
+from turbogs_plugin.train.run import fit, train
 
 pytestmark = pytest.mark.usefixtures("plotted")
 
@@ -44,6 +46,16 @@ def test_the_dark_photo_gets_a_dark_exposure_and_the_mean_stays_the_identity(sce
     assert gains[DARK] < -0.03 and (gains[torch.arange(7) != DARK] > gains[DARK] + 0.03).all()
     assert trainer.exposures.offsets.mean(dim=0).abs().max() < 1e-6
     assert trainer.exposures.steps.tolist() == [25] * 7
+
+
+@pytest.mark.parametrize("budget", ["", "1ms"])
+def test_training_begins_with_the_gains_that_its_plan_has_compared(scene, monkeypatch, budget):
+    gains, seen = PhotoGains(np.zeros((7, 3)), np.ones(7, dtype=bool), 0.3, 0.01), []
+    monkeypatch.setattr(facts, "compare_exposures", lambda *_: gains)
+    monkeypatch.setattr(training_state, "compare_exposures", lambda *_: pytest.fail("they are compared again"))
+    monkeypatch.setattr(training_state, "set_gains", lambda exposures, given: seen.append(given))
+    fit(scene, "train.exposure=auto", "train.iterations=2", "train.device=cpu", f"budget.time='{budget}'")
+    assert seen == [gains] * (2 if budget else 1)  # in the trial of a time budget, too
 
 
 def test_the_first_iteration_is_that_without_exposures(scene):
@@ -72,9 +84,9 @@ def test_a_run_goes_on_bit_for_bit_and_from_host_memory(scene, loss):
     assert_identical(whole.state_dict(), second.state_dict())
 
 
-def test_a_saved_run_is_shown_as_its_trainer_is(capture, tmp_path):
+def test_a_saved_run_is_shown_as_its_trainer_is(capture, scene, tmp_path):
     """Test views with the exposures of their neighbours, training views with their own; a file has none."""
-    run, scene = tmp_path / "run", load_scene(capture)
+    run = tmp_path / "run"
     outcome = train(tiny_config(capture, "train.exposure=true"), run)
     assert 0 < read_history(outcome.folder.history)[-1].own_ssim < 1
     assert "PSNR in dB of the model's own colours" in write_report(outcome).read_text()

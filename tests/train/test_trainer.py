@@ -103,13 +103,8 @@ def test_a_run_stopped_again_and_again_is_the_same_bit_for_bit(capture, whole, t
     config = tiny_config(capture).without_plan()
     trainer = Trainer(config, open_scene(config.scene, True), torch.device("cpu"))
     initialise, place = Trainer.initialise_maps, tmp_path / "run"
-
-    def interrupted(trainer):
-        initialise(trainer)
-        signal.raise_signal(signal.SIGINT)
-
     with monkeypatch.context() as context:
-        context.setattr(Trainer, "initialise_maps", interrupted)
+        context.setattr(Trainer, "initialise_maps", lambda each: (initialise(each), signal.raise_signal(signal.SIGINT)))
         assert run.train(tiny_config(capture), place).signal == signal.SIGINT
     trainer.initialise_maps()
     assert_identical(trainer.state_dict(), saved(place))

@@ -162,8 +162,7 @@ def _tell(session: RunSession, reported: bool) -> int:
     if session.signal is not None:
         print(f"stopped and saved: go on with  turbogs train --resume {shlex.quote(str(folder.path))}", file=sys.stderr)
         return 128 + session.signal
-    print(history_table(session.history))
-    print(f"\n{session.wall.text()}")
+    print(f"{history_table(session.history)}\n\n{session.wall.text()}")
     if reported:
         print(f"report  {folder.report}\nrenders {folder.path / 'report'}")
     print(f"model   {folder.model}")
