@@ -35,6 +35,14 @@ def capture(tmp_path_factory) -> Path:
     return tiny_capture(tmp_path_factory.mktemp("tiny"))
 
 
+@pytest.fixture(scope="module")
+def scene(capture: Path):
+    """The `capture`. Not to be changed."""
+    from turbogs_plugin.captures import load_scene
+
+    return load_scene(capture)
+
+
 @pytest.fixture
 def drawn() -> None:
     """For tests of what plots look like."""

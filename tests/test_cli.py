@@ -22,7 +22,6 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.renders import distinct_stems
 from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.train import inputs, run
-from turbogs_plugin.train.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("plotted")
 
@@ -79,25 +78,21 @@ def test_a_bad_setting_is_refused(turbogs, capture, tmp_path, arguments, words):
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
-@pytest.mark.parametrize("words", ["train CAPTURE --out NEW", "train PHOTOS --out NEW", "eval RUN", "render RUN"])
+@pytest.mark.parametrize("words", ["train CAPTURE --out NEW", "train PHOTOS --out NEW", "eval RUN", "render RUN", ""])
 def test_cuda_asked_for_and_absent(turbogs, capture, finished, tmp_path, monkeypatch, words):
-    """Nothing is decoded before, and no camera looked for."""
+    """Nothing is decoded before, and no camera looked for; nor where a run of a GPU is to go on."""
     monkeypatch.setattr(inputs, "load_scene", lambda *_, **__: pytest.fail("the capture was loaded"))
     monkeypatch.setattr("turbogs_plugin.reconstruct.run.reconstruct_beside", lambda *_: pytest.fail("solved"))
     places = {"CAPTURE": capture, "PHOTOS": capture / "images", "NEW": tmp_path / "run", "RUN": finished}
-    told = turbogs(*(places.get(word, word) for word in words.split()), "--device", "cuda")
-    assert_refused(told, "CUDA", "--device cpu")
+    call = [*(places.get(word, word) for word in words.split()), "--device", "cuda"]
+    if not words:
+        stopped = Path(shutil.copytree(finished, tmp_path / "stopped"))
+        (stopped / "report.md").unlink()
+        file = stopped / "config.yaml"
+        file.write_text(file.read_text().replace("device: cpu", "device: cuda"))
+        call = ["train", "--resume", stopped]
+    assert_refused(turbogs(*call), "CUDA", "turbogs doctor", "--device cpu")
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
-def test_a_run_of_a_gpu_goes_on_where_there_is_one(turbogs, finished, tmp_path, monkeypatch):
-    folder = Path(shutil.copytree(finished, tmp_path / "run"))
-    (folder / "report.md").unlink()
-    file = folder / "config.yaml"
-    file.write_text(file.read_text().replace("device: cpu", "device: cuda"))
-    monkeypatch.setattr(inputs, "load_scene", lambda *_, **__: pytest.fail("the capture was loaded"))
-    assert_refused(turbogs("train", "--resume", folder), "CUDA", "turbogs doctor")
 
 
 def test_a_capture_that_a_run_has_trained_on_is_not_judged_again(turbogs, finished, tmp_path, monkeypatch):
@@ -107,18 +102,13 @@ def test_a_capture_that_a_run_has_trained_on_is_not_judged_again(turbogs, finish
     assert turbogs("train", "--resume", tmp_path / "run")[0] == 0
 
 
-def test_an_output_folder_with_another_run_is_left_alone(turbogs, capture, finished):
-    before = tree(finished)
-    assert_refused(turbogs("train", capture, "--out", finished, "--device", "cpu", *QUICK), "not empty", "--resume")
-    assert tree(finished) == before
-
-
-def test_an_output_folder_with_other_files_is_left_alone(turbogs, capture, tmp_path):
+def test_an_output_folder_with_other_files_is_left_alone(turbogs, capture, finished, tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
-    assert_refused(turbogs("train", capture, "--out", tmp_path, "--device", "cpu", *QUICK), "not empty")
-    assert_refused(turbogs("train", capture, "--out", tmp_path / "thesis.tex", *QUICK), "not empty")
+    before = tree(finished)
+    for out in (finished, tmp_path, tmp_path / "thesis.tex"):
+        assert_refused(turbogs("train", capture, "--out", out, "--device", "cpu", *QUICK), "not empty", "--resume")
     assert_refused(turbogs("train", capture, "--out", tmp_path / "thesis.tex" / "run", *QUICK), "cannot be made")
-    assert tree(tmp_path) == {"thesis.tex": b"mine"}
+    assert tree(tmp_path) == {"thesis.tex": b"mine"} and tree(finished) == before
 
 
 @pytest.mark.parametrize("out", ["/proc/run", "dangling", "dangling/run"])
@@ -139,20 +129,13 @@ def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch):
     assert_refused(turbogs("demo", tmp_path / "demo"), "the system says: No space left on device; choose another")
 
 
-@pytest.mark.parametrize(
-    "order",
-    [
-        "plan SCENE train.seed=5 --config demo --device cpu train.iterations=7",
-        "plan SCENE --config demo --device cpu train.iterations=7 train.seed=5",
-        "plan --config demo --device cpu SCENE train.iterations=7 train.seed=5",
-    ],
-)
+@pytest.mark.parametrize("order", ["SCENE train.seed=5 OPTIONS", "SCENE OPTIONS train.seed=5", "OPTIONS SCENE"])
 def test_overrides_stand_anywhere(turbogs, capture, monkeypatch, order):
-    seen = []
+    seen, words = [], order.replace("SCENE", str(capture)).replace("OPTIONS", "--config demo --device cpu").split()
     monkeypatch.setattr(run, "plan_run", lambda config, count: seen.append(config.train) or SimpleNamespace(text=str))
-    code, _, error = turbogs(*order.replace("SCENE", str(capture)).split())
+    code, _, error = turbogs("plan", *words, "train.iterations=7")
     assert code == 0, error
-    assert [(train.seed, train.iterations) for train in seen] == [(5, 7)]
+    assert [(train.seed, train.iterations) for train in seen] == [(5 if "seed" in order else 0, 7)]
 
 
 def test_what_follows_an_option_is_no_override(turbogs, capture, tmp_path):
@@ -170,8 +153,10 @@ def test_incomplete_and_contradictory_calls(turbogs, capture, tmp_path):
     assert_refused(turbogs("train"), "SCENE")
     assert_refused(turbogs("train", capture), "--out")
     assert_refused(turbogs("train", "train.iterations=2", "--out", tmp_path / "run"), "no such scene")
-    assert_refused(turbogs("train", capture, "--resume", tmp_path), "nothing else")
-    assert_refused(turbogs("train", "--resume", tmp_path, "--device", "cpu"), "nothing else")
+    for other in ([capture], ["--device", "cpu"]):
+        assert_refused(turbogs("train", *other, "--resume", tmp_path), "nothing else")
+    for words in (["eval"], ["render"], ["export"], ["train", "--resume"]):
+        assert_refused(turbogs(*words, tmp_path), "holds no run")
     assert not list(tmp_path.iterdir())
 
 
@@ -183,16 +168,14 @@ def test_an_empty_path_is_not_the_current_folder(turbogs, copy, tmp_path, monkey
     assert tree(tmp_path) == before
 
 
-@pytest.mark.parametrize(("viewer", "port"), [(["--viewer"], 8080), (["--viewer", "9000"], 9000)])
-@pytest.mark.parametrize("last", [True, False])
-def test_a_viewer_has_a_usual_port(turbogs, capture, tmp_path, monkeypatch, viewer, port, last):
+@pytest.mark.parametrize(("words", "port"), [("--viewer --out RUN", 8080), ("--out RUN --viewer 9000", 9000)])
+def test_a_viewer_has_a_usual_port(turbogs, capture, tmp_path, monkeypatch, words, port):
     def page(host, port, training):
         raise InputError(f"at {host}:{port}")
 
     monkeypatch.setattr("turbogs_plugin.viewer.server.Page", page)
-    out = ("--out", tmp_path / "run")
-    words = (*out, *viewer) if last else (*viewer, *out)
-    assert_refused(turbogs("train", capture, *QUICK, *words), f"at 127.0.0.1:{port}")
+    call = words.replace("RUN", str(tmp_path / "run")).split()
+    assert_refused(turbogs("train", capture, *QUICK, *call), f"at 127.0.0.1:{port}")
 
 
 def test_a_run_is_no_capture(turbogs, finished, capture, tmp_path):
@@ -203,18 +186,12 @@ def test_a_run_is_no_capture(turbogs, finished, capture, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_commands_without_a_run(turbogs, tmp_path):
-    for words in (["eval"], ["render"], ["export"], ["train", "--resume"]):
-        assert_refused(turbogs(*words, tmp_path), "holds no run")
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_run_without_or_with_a_broken_checkpoint(turbogs, finished, tmp_path):
     broken = Path(shutil.copytree(finished, tmp_path / "broken"))
     checkpoint = next((broken / "checkpoints").glob("*.pt"))
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
-    for arguments in (["eval", broken], ["export", broken]):
-        assert_refused(turbogs(*arguments), "cannot be used", checkpoint.name)
+    for verb in ("eval", "export"):
+        assert_refused(turbogs(verb, broken), "cannot be used", checkpoint.name)
     shutil.rmtree(broken / "checkpoints")
     before = tree(broken)
     for verb in ("eval", "render", "export"):
@@ -275,27 +252,15 @@ def test_depth_images_are_in_the_captures_own_units(turbogs, capture, finished):
         assert Image.open(folder / f"{stem}.png").size == (40, 24)
 
 
-def test_version(turbogs):
-    assert turbogs("--version") == (0, f"turbogs {__version__}\n", "")
-
-
 def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypatch):
     stop_after(monkeypatch, 3)
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *TINY)
-    assert code == 130 and out == ""
-    assert f"turbogs train --resume {tmp_path / 'run'}" in err
+    assert code == 130 and out == "" and f"turbogs train --resume {tmp_path / 'run'}" in err
     assert (tmp_path / "run/checkpoints/iteration-000003.pt").is_file()
-    monkeypatch.undo()
 
 
 def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(turbogs, capture, tmp_path, monkeypatch):
-    step = Trainer.step
-
-    def spoiled(trainer):
-        step(trainer)
-        trainer.gaussians.opacities[:] = torch.inf
-
-    monkeypatch.setattr(Trainer, "step", spoiled)
+    stop_after(monkeypatch, 1, lambda trainer: trainer.gaussians.opacities.fill_(torch.inf))
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *QUICK)
     errors = [line for line in err.splitlines() if line.startswith("turbogs: error:")]
     assert code == 1 and out == "" and len(errors) == 1 and "not finite" in errors[0]
@@ -344,3 +309,4 @@ def test_every_command_has_help(turbogs, verb):
     assert code == 0 and f"usage: turbogs {verb}" in out and err == ""
     code, out, err = turbogs()
     assert code == 0 and f"\n  {verb} " in out and err == ""
+    assert turbogs("--version") == (0, f"turbogs {__version__}\n", "")

@@ -36,14 +36,12 @@ def diagnosis() -> str:
     for index, gpu in enumerate(map(torch.cuda.get_device_properties, range(count))):
         lines.append(f"{'GPU':<16}{index}: {gpu.name}, sm_{gpu.major}{gpu.minor}, {gpu.total_memory / 2**30:.0f} GiB")
     lines += [f"{'nvcc':<16}{shutil.which('nvcc') or 'not found'}", f"{'kernels':<16}{usable}"]
-    if torch.version.cuda is None:
-        missing.append("CUDA in PyTorch: training runs on the CPU, by the torch reference")
-    elif not on_gpu:
-        missing.append("a GPU that answers: training runs on the CPU, by the torch reference")
+    if not on_gpu:
+        what = "a GPU that answers" if torch.version.cuda else "CUDA in PyTorch"
+        missing.append(f"{what}: training runs on the CPU, by the torch reference")
     if reason := missing_bytecode():
         missing.append(reason)
-    absent = [name for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
-    missing += [f"{name}: LPIPS is not computed" for name in absent]
+    missing += [f"{name}: LPIPS is not computed" for name in LPIPS_PACKAGES if importlib.util.find_spec(name) is None]
     if importlib.util.find_spec("viser") is None:
         missing.append(f"viser: no live viewer; {INSTALL_VIEWER}")
     if lacking := lacking_packages():

@@ -51,11 +51,8 @@ class Half:
 class Unresolved:
     value: "Absent" = None
 
-class Outer:
-    Inner = MySampler
-
 class Plain:
-    sample = MySampler.sample
+    Inner = MySampler
 
 instance = MySampler()
 """
@@ -89,10 +86,8 @@ def test_every_name_builds_with_its_defaults(kind, name):
 
 
 def test_an_entry_point_is_a_type(plug_in):
-    plug_in("pixel_sampler", "few", "third_party:Outer.Inner")
+    plug_in("pixel_sampler", "few", "third_party:Plain.Inner")
     assert build("pixel_sampler", {"type": "few", "share": 0.5}).share == 0.5
-    with pytest.raises(InputError, match=r"unknown loss\.type"):
-        build("loss", {"type": "few"})
     plug_in("pixel_sampler", "dense", "third_party:MySampler")
     assert type(build("pixel_sampler", {"type": "dense"})).__name__ == "DensePixelSampler"
 
@@ -104,13 +99,10 @@ def test_a_broken_entry_point_is_named(plug_in, value):
         build("pixel_sampler", {"type": "few"})
 
 
-@pytest.mark.parametrize(
-    ("source", "reason"),
-    [("import sys; sys.exit(0)", "SystemExit"), ("raise RuntimeError('two\\nlines')", "RuntimeError: two lines")],
-)
-def test_a_module_that_breaks_as_it_is_imported_is_named(source, reason):
+@pytest.mark.parametrize("source", ["import sys; sys.exit('two\\nlines')", "raise RuntimeError('two\\nlines')"])
+def test_a_module_that_breaks_as_it_is_imported_is_named(source):
     Path("breaking.py").write_text(source)
-    with pytest.raises(InputError, match=f"breaking:X.*cannot be imported: {reason}"):
+    with pytest.raises(InputError, match=r"breaking:X.*cannot be imported: (SystemExit|RuntimeError): two lines$"):
         build("pixel_sampler", {"type": "breaking:X"})
 
 
@@ -135,13 +127,10 @@ def test_what_does_not_fit_is_refused(kind, mapping, words):
         build(kind, mapping)
 
 
-RAN = "import pathlib; pathlib.Path('ran').touch()\n" + MODULE
-
-
 @pytest.fixture
 def shared_run(tmp_path):
     """A run whose density control lies beside its configuration, and notes that it was imported."""
-    (tmp_path / "third_party.py").write_text(RAN)
+    (tmp_path / "third_party.py").write_text(f"import pathlib; pathlib.Path('ran').touch()\n{MODULE}")
     config = load_config("turbogs", ["scene.path=none"]).without_plan().to_mapping()
     config["density"] = {"type": "third_party:Fading", "opacity_decay": 0.2}
     (tmp_path / "config.yaml").write_text(yaml_text(config))
@@ -174,18 +163,12 @@ def test_an_installed_module_of_a_run_needs_no_trust(shared_run, monkeypatch, tm
     assert shared_run.read_config(built=True).density["opacity_decay"] == 0.2
 
 
-def test_a_class_that_does_not_inherit_has_the_defaults_of_its_protocol():
-    assert build("pixel_sampler", {"type": "third_party:MySampler"}).heeds_masks is False
-    assert build("loss", {"type": "third_party:MyLoss"}).terms is None
-
-
-def test_a_decay_without_an_interval_may_be_scaled():
-    config = load_config("turbogs", ["density.type=third_party:Fading"])
-    assert with_iterations(config, 500).density == {"type": "third_party:Fading", "opacity_decay": 0.2}
-
-
-def test_a_type_may_be_a_class_in_a_file():
+def test_a_type_may_be_a_class_in_a_file_and_has_the_defaults_of_its_protocol():
     Path("mine.yaml").write_text("base: demo\npixel_sampler: {type: 'third_party:MySampler', share: 0.3}\n")
     from_yaml = load_config("mine.yaml")
     overridden = load_config("demo", ["pixel_sampler.type=third_party:MySampler", "pixel_sampler.share=0.3"])
     assert from_yaml == overridden and from_yaml.build("pixel_sampler").share == 0.3
+    assert from_yaml.build("pixel_sampler").heeds_masks is False
+    assert build("loss", {"type": "third_party:MyLoss"}).terms is None
+    fading = {"type": "third_party:Fading", "opacity_decay": 0.2}  # and no interval
+    assert with_iterations(load_config("turbogs", ["density.type=third_party:Fading"]), 500).density == fading

@@ -3,6 +3,7 @@
 import re
 
 import pytest
+from turbogs_plugin.captures.camera_json import read_frames
 
 from turbogs_plugin.config.components import KINDS, strategy_class
 from turbogs_plugin.config.configuration import (
@@ -17,8 +18,9 @@ from turbogs_plugin.config.configuration import (
 from turbogs_plugin.config.sections import parse_bytes, parse_seconds
 from turbogs_plugin.config.typed import settings_of
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.files import read_text
 from turbogs_plugin.strategies import TYPES
-from turbogs_plugin.yaml_json import DEPTH_LIMIT, SIZE_LIMIT, parse_json, parse_yaml
+from turbogs_plugin.yaml_json import DEPTH_LIMIT, SIZE_LIMIT, parse_json, parse_yaml, yaml_text
 
 
 @pytest.fixture
@@ -38,65 +40,52 @@ def test_packaged_configurations_are_complete_and_round_trip(name):
         config.build(kind)
 
 
-@pytest.mark.parametrize(
-    ("text", "value"), [("1e-4", 1e-4), ("5e-1", 0.5), ("1", 1.0), (".5", 0.5), ("1E-4", 1e-4), ("0.25", 0.25)]
-)
-def test_numbers_are_numbers(text, value):
+@pytest.mark.parametrize("text", ["1e-4", "5e-1", "1", ".5", "1E-4", "0.25"])
+def test_numbers_are_numbers(text):
     beta = load_config("turbogs", [f"maps.beta={text}"]).maps.beta
-    assert beta == value and isinstance(beta, float)
-    assert load_config("turbogs", ["train.iterations=1e3"]).train.iterations == 1000
+    assert beta == float(text) and isinstance(beta, float)
 
 
 def test_yaml_over_dataclass_and_override_over_yaml(write):
-    file = write("base: turbogs\ntrain: {iterations: 10, seed: 3}\nmaps: {beta: 0.9}\n")
+    file = write("base: turbogs\ntrain: {iterations: 1e3, seed: 3}\nmaps: {beta: 0.9}\n")
     config = load_config(file, ["train.seed=5"])
-    assert (config.train.iterations, config.train.seed, config.maps.beta) == (10, 5, 0.9)
+    assert (config.train.iterations, config.train.seed, config.maps.beta) == (1000, 5, 0.9)
     assert config.train.sh_degree == 3
 
 
-def test_another_type_starts_its_section_afresh():
+def test_another_type_starts_its_section_afresh_but_for_learning_rates():
     config = load_config("turbogs", ["schedule.pixel_budget=0.5", "schedule.type=fixed"])
     assert config.schedule == {"type": "fixed", "views": 3, "pixel_budget": 0.5}
     same = apply_overrides({"schedule": {"alpha": 2.0}}, ["schedule.type=sinusoidal"])
     assert same == {"schedule": {"alpha": 2.0, "type": "sinusoidal"}}
-
-
-def test_another_type_of_optimizer_keeps_the_learning_rates():
     config = load_config("turbogs", ["optimizer.type=sparse_adam", "optimizer.learning_rates.quats=2e-3"])
     rates = load_config("turbogs").optimizer["learning_rates"]
     assert config.optimizer["learning_rates"] == {**rates, "quats": 2e-3} != rates
+    assert config.build("optimizer").learning_rates.quats == 2e-3
 
 
-def test_nested_dataclasses_of_a_strategy():
-    config = load_config("turbogs", ["optimizer.learning_rates.batch_scale=1"])
-    assert config.optimizer["learning_rates"]["batch_scale"] == 1.0
-    assert config.build("optimizer").learning_rates.batch_scale == 1.0
+BAD_OVERRIDES = {
+    "train.iteration=5": "train.iteration.*did you mean 'iterations'",
+    "trian.iterations=5": "trian.*did you mean 'train'",
+    "schedule.type=sinus": "sinus.*did you mean 'sinusoidal'.*fixed",
+    "optimizer.learning_rates.mean=1": "learning_rates.mean.*did you mean 'means'",
+    "schedule.min_views=20": "20.*max_views|max_views.*20",
+    "optimizer.learning_rates.means=-1": "means.*-1",
+    "train.iterations=2147483648": "iterations.*2147483648",
+    "train.iterations=many": "train.iterations.*whole number.*auto.*many",
+    "maps.beta=fast": "maps.beta.*number",
+    "train.evaluate_at=0.5": "train.evaluate_at.*list",
+    "density.split=middle": "density.split.*sample.*long_axis",
+    "budget.time=1000000h": "time.*at most 100h",
+    "train..seed=1": "section.key=value",
+    "train.device=tpu": "device.*tpu.*cuda",
+}
 
 
-BAD_OVERRIDES = [
-    ("train.iteration=5", ["train.iteration", "did you mean 'iterations'?"]),
-    ("trian.iterations=5", ["trian", "did you mean 'train'?"]),
-    ("schedule.type=sinus", ["sinus", "did you mean 'sinusoidal'?", "fixed"]),
-    ("optimizer.learning_rates.mean=1", ["learning_rates.mean", "did you mean 'means'?"]),
-    ("schedule.min_views=20", ["max_views", "10", "20"]),
-    ("optimizer.learning_rates.means=-1", ["means", "-1"]),
-    ("train.iterations=2147483648", ["iterations", "2147483648"]),
-    ("train.iterations=many", ["train.iterations", "whole number", "auto", "many"]),
-    ("maps.beta=fast", ["maps.beta", "number"]),
-    ("train.evaluate_at=0.5", ["train.evaluate_at", "list"]),
-    ("density.split=middle", ["density.split", "sample", "long_axis"]),
-    ("budget.time=1000000h", ["time", "at most 100h"]),
-    ("train..seed=1", ["section.key=value"]),
-    ("train.device=tpu", ["device", "tpu", "cuda"]),
-]
-
-
-@pytest.mark.parametrize(("override", "words"), BAD_OVERRIDES, ids=[override for override, _ in BAD_OVERRIDES])
-def test_a_bad_override_is_named(override, words):
-    with pytest.raises(InputError) as error:
+@pytest.mark.parametrize("override", BAD_OVERRIDES)
+def test_a_bad_override_is_named(override):
+    with pytest.raises(InputError, match=BAD_OVERRIDES[override]):
         load_config("turbogs", [override])
-    for word in words:
-        assert word in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -111,9 +100,8 @@ def test_a_bad_override_is_named(override, words):
         ("train: {seed: 1}\ntrain: {seed: 2}", "not valid YAML.*twice"),
         ("a: " + "[" * (DEPTH_LIMIT + 1), "levels deep"),
         ("a: " + "x" * SIZE_LIMIT, "more than"),
-        ("train: 5", "train: expected a mapping"),
         ("train: {seed: 2001-01-01}", "train.seed: expected a whole number, got '2001-01-01'"),
-        ("base: mine.yaml", "mine"),
+        ("base: mine.yaml", "circle"),
     ],
     ids=lambda text: text[:24],
 )
@@ -128,15 +116,20 @@ def test_what_is_no_json_is_refused(text):
         parse_json(text, "'a.json'")
 
 
+@pytest.mark.parametrize("read", [read_frames, read_text])
+def test_a_json_file_is_refused_before_it_is_read(tmp_path, read):
+    with open(tmp_path / "a.json", "wb") as file:
+        file.truncate(2**42)  # which no memory has
+    with pytest.raises(InputError, match=r"a\.json has more than 64 MiB: take out what is not needed"):
+        read(tmp_path / "a.json")
+
+
 def test_a_base_is_looked_for_beside_its_file(write, tmp_path, monkeypatch):
-    (tmp_path / "common").mkdir()
-    (tmp_path / "common/seed.yaml").write_text("base: turbogs\ntrain: {seed: 7}\n")
-    file = write("base: common/seed.yaml\nmaps: {beta: 0.9}\n")
-    elsewhere = tmp_path / "elsewhere"
-    (elsewhere / "common").mkdir(parents=True)
-    (elsewhere / "common/seed.yaml").write_text("base: turbogs\ntrain: {seed: 8}\n")
-    monkeypatch.chdir(elsewhere)
-    config = load_config(file)
+    for seed, folder in ((7, "common"), (8, "elsewhere/common")):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "seed.yaml").write_text(f"base: turbogs\ntrain: {{seed: {seed}}}\n")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    config = load_config(write("base: common/seed.yaml\nmaps: {beta: 0.9}\n"))
     assert (config.train.seed, config.maps.beta) == (7, 0.9)
     with pytest.raises(InputError, match="unknown config 'turbgos': did you mean 'turbogs'"):
         load_config(write("base: turbgos\n"))
@@ -149,23 +142,14 @@ def test_an_override_is_taken_whole(text):
 
 @pytest.mark.parametrize("path", ["1e3", "0x10", "null", "2001-01-01", "a: b", "${oc.env:HOME}", "#1"])
 def test_a_text_is_read_back_as_it_was(path):
-    config = load_config("demo")
-    config.scene.path = path
-    assert resolve(parse_yaml(config.to_yaml(), "config")).scene.path == path
-
-
-def test_a_circle_of_bases_is_refused(write, tmp_path):
-    file = write(f"base: {tmp_path / 'mine.yaml'}\n")
-    with pytest.raises(InputError, match="circle"):
-        load_config(file)
+    assert parse_yaml(yaml_text({"path": path}), "config") == {"path": path}
 
 
 def test_missing_and_binary_files_are_refused(tmp_path):
-    with pytest.raises(InputError, match="No such file"):
-        load_config(str(tmp_path / "absent.yaml"))
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="UTF-8"):
-        load_config(str(tmp_path / "binary.yaml"))
+    for name, message in (("absent.yaml", "No such file"), ("binary.yaml", "UTF-8")):
+        with pytest.raises(InputError, match=message):
+            load_config(str(tmp_path / name))
 
 
 def test_the_configuration_of_a_run_is_complete():

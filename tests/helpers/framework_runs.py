@@ -79,9 +79,11 @@ def tiny_config(capture: Path | str, *overrides: str) -> Config:
 
 
 def tiny_trainer(scene: Scene | Path, *overrides: str) -> Trainer:
-    """A trainer on the CPU, on a scene or a capture, whose first maps are not there yet."""
+    """A trainer on the CPU, on a scene or a capture, with its first maps."""
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
-    return Trainer(tiny_config("capture", *overrides).without_plan(), scene, torch.device("cpu"))
+    trainer = Trainer(tiny_config("capture", *overrides).without_plan(), scene, torch.device("cpu"))
+    trainer.initialise_maps()
+    return trainer
 
 
 def interrupt(trainer: Trainer) -> None:

@@ -151,7 +151,7 @@ def test_weights_have_mean_one_and_same_draw(importance):
     assert weights.dtype == torch.float32 and (weights > 0).all() and weights.std() > 0.01
     assert (weighted.weights[~weighted.filled] == 0).all()
     assert weights.mean().item() == pytest.approx(1, abs=1e-5)
-    everything = ErrorGuidedPixelSampler(unit=unit, importance=importance).sample(maps, views, 1.0, step(3))
+    everything = ErrorGuidedPixelSampler(importance=importance).sample(maps, views, 1.0, step(3))
     assert (everything.weights[everything.filled] == 1).all()
 
 

@@ -171,7 +171,6 @@ def test_a_large_file_is_brought_to_the_disk_while_it_is_written(tmp_path, monke
     target, brought, bring = tmp_path / "model", threading.Event(), os.fdatasync
 
     def write(file):
-        brought.clear()
         file.write(b"new")
         assert brought.wait(60)
 
@@ -182,8 +181,9 @@ def test_a_large_file_is_brought_to_the_disk_while_it_is_written(tmp_path, monke
         brought.set()
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
+    brought.clear()
     monkeypatch.setattr(os, "fdatasync", full)
     with pytest.raises(OSError, match="No space left") as failed:
-        files.write_atomically(target, lambda file: (file.write(b"newer"), brought.wait(60)), large=True)
+        files.write_atomically(target, lambda file: (write(file), file.write(b"er")), large=True)
     assert failed.value.filename == str(target)
     assert target.read_bytes() == b"new" and os.listdir(tmp_path) == ["model"]

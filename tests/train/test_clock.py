@@ -20,20 +20,11 @@ pytestmark = pytest.mark.usefixtures("plotted")
 def test_a_run_records_the_wall_until_its_model_and_the_parts_of_its_report(capture, tmp_path, monkeypatch):
     clock = SimulatedTime(monkeypatch, tick=1e-8)
     clock.in_iterations(monkeypatch, lambda trainer: 1.0)
-    save = sessions.save_ply
-
-    def saving(*arguments) -> None:
-        clock.passes(10.0)
-        save(*arguments)
-
-    def reporting(session: sessions.RunSession) -> None:
-        clock.passes(100.0)
-        write_report(session)
-
-    monkeypatch.setattr(sessions, "save_ply", saving)
-    wall = WallClock()
+    save, wall = sessions.save_ply, WallClock()
+    monkeypatch.setattr(sessions, "save_ply", lambda *model: (clock.passes(10.0), save(*model)))
     clock.passes(1000.0)
-    session = run.train(tiny_config(capture), tmp_path / "run", reporting, wall)
+    report = lambda session: (clock.passes(100.0), write_report(session))  # noqa: E731
+    session = run.train(tiny_config(capture), tmp_path / "run", report, wall)
     record = WallRecord.read(session.folder.wall)
     assert record.train_seconds == pytest.approx(14.07, abs=1e-3)
     assert record.train_seconds == pytest.approx(session.history[-1].train_seconds)

@@ -8,18 +8,19 @@ import torch
 from helpers.framework_runs import assert_identical, tiny_capture, tiny_config, tiny_trainer
 from PIL import Image
 
-from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.export.renders import render_run
+from turbogs_plugin.plan import facts
+from turbogs_plugin.plan.photo_gains import PhotoGains
 from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.report.run_report import write_report
+from turbogs_plugin.train import training_state
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.look import Look, interpolated_exposures
 from turbogs_plugin.train.metrics import evaluate, render_view
-from turbogs_plugin.train.run import train
-from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.train.run import fit, train
 
 pytestmark = pytest.mark.usefixtures("plotted")
 
@@ -37,19 +38,8 @@ def capture(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
-def scene(capture):
-    return load_scene(capture)
-
-
-def trainer_of(scene, *overrides: str) -> Trainer:
-    trainer = tiny_trainer(scene, *overrides)
-    trainer.initialise_maps()
-    return trainer
-
-
 def test_the_dark_photo_gets_a_dark_exposure_and_the_mean_stays_the_identity(scene):
-    trainer = trainer_of(scene, *ON, "train.iterations=60")
+    trainer = tiny_trainer(scene, *ON, "train.iterations=60")
     for _ in range(25):
         trainer.step()
     gains = trainer.exposures.offsets[:, :, :3].diagonal(dim1=1, dim2=2).mean(dim=1)  # [V]
@@ -58,10 +48,20 @@ def test_the_dark_photo_gets_a_dark_exposure_and_the_mean_stays_the_identity(sce
     assert trainer.exposures.steps.tolist() == [25] * 7
 
 
+@pytest.mark.parametrize("budget", ["", "0.01s"])
+def test_training_begins_with_the_gains_that_its_plan_has_compared(scene, monkeypatch, budget):
+    gains, seen = PhotoGains(np.zeros((7, 3)), np.ones(7, dtype=bool), 0.3, 0.01), []
+    monkeypatch.setattr(facts, "compare_exposures", lambda *_: gains)
+    monkeypatch.setattr(training_state, "compare_exposures", lambda *_: pytest.fail("they are compared again"))
+    monkeypatch.setattr(training_state, "set_gains", lambda exposures, given: seen.append(given))
+    fit(scene, "train.exposure=auto", "train.iterations=2", "train.device=cpu", f"budget.time='{budget}'")
+    assert seen == [gains] * (2 if budget else 1)  # in the trial of a time budget, too
+
+
 def test_the_first_iteration_is_that_without_exposures(scene):
     """Until the first step of Adam, every exposure is the identity to the bit."""
     alone = "train.average_last=0"  # the mean has exposures too
-    states = [trainer_of(scene, alone, *overrides) for overrides in ((), ("train.exposure=true",))]
+    states = [tiny_trainer(scene, alone, *overrides) for overrides in ((), ("train.exposure=true",))]
     for trainer in states:
         trainer.step()
     off, on = (trainer.state_dict() for trainer in states)
@@ -72,8 +72,9 @@ def test_the_first_iteration_is_that_without_exposures(scene):
 @pytest.mark.parametrize("loss", ["charbonnier_ncc", "sparse_ssim"])
 def test_a_run_goes_on_bit_for_bit_and_from_host_memory(scene, loss):
     overrides = ("train.exposure=true", f"loss.type={loss}", "schedule.max_views=2")
-    hosted = (*overrides, "train.pixels_place=host")
-    whole, first, second = trainer_of(scene, *overrides), trainer_of(scene, *hosted), trainer_of(scene, *overrides)
+    first, whole, second = (
+        tiny_trainer(scene, *overrides, f"train.pixels_place={place}") for place in ("host", "device", "device")
+    )
     for trainer in 3 * (first, whole, whole):
         trainer.step()
     second.load_state_dict(first.state_dict())
@@ -83,9 +84,9 @@ def test_a_run_goes_on_bit_for_bit_and_from_host_memory(scene, loss):
     assert_identical(whole.state_dict(), second.state_dict())
 
 
-def test_a_saved_run_is_shown_as_its_trainer_is(capture, tmp_path):
+def test_a_saved_run_is_shown_as_its_trainer_is(capture, scene, tmp_path):
     """Test views with the exposures of their neighbours, training views with their own; a file has none."""
-    run, scene = tmp_path / "run", load_scene(capture)
+    run = tmp_path / "run"
     outcome = train(tiny_config(capture, "train.exposure=true"), run)
     assert 0 < read_history(outcome.folder.history)[-1].own_ssim < 1
     assert "PSNR in dB of the model's own colours" in write_report(outcome).read_text()
@@ -116,7 +117,7 @@ def mean_of(table: str, column: str) -> float:
 
 def test_test_views_are_shown_with_what_their_neighbours_have(scene):
     """Nothing but exposures changes: the model's own colours have the errors that they had."""
-    trainer = trainer_of(scene, "train.exposure=true")
+    trainer = tiny_trainer(scene, "train.exposure=true")
     views = (trainer.gaussians, scene.test)
     before = evaluate(*views, trainer.look(scene.test.names)).mean
     assert before.psnr == before.own_psnr  # every exposure is the identity
@@ -168,7 +169,7 @@ def test_exposed_is_the_affine_map_of_each_colour():
 
 
 def test_an_iteration_exposes_its_colours_once(scene):
-    trainer = trainer_of(scene, *ON, "maps.beta=1")
+    trainer = tiny_trainer(scene, *ON, "maps.beta=1")
     trainer.exposures.offsets[:] = torch.linspace(-0.3, 0.2, 84).view(7, 3, 4)
     expected, step = [trainer.dense_errors(view) for view in range(7)], trainer.now
     trainer.step()
@@ -179,7 +180,7 @@ def test_an_iteration_exposes_its_colours_once(scene):
 
 
 def test_the_maps_begin_with_each_exposure_applied_once(scene):
-    trainer, view = trainer_of(scene, "train.exposure=true"), DARK
+    trainer, view = tiny_trainer(scene, "train.exposure=true"), DARK
     trainer.exposures.offsets[view] = torch.linspace(-0.3, 0.2, 12).view(3, 4)
     trainer.initialise_maps()
     photo, exposure = trainer.views.photos.image(view), trainer.exposures.offsets[view]

@@ -15,7 +15,6 @@ from helpers.models import random_gaussians
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.commands.options import GivenOptions
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
@@ -29,6 +28,7 @@ from turbogs_plugin.model.spz import save_spz
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint
+from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.saved_model import load_given, load_model
 from turbogs_plugin.train.training_state import initial_gaussians
 from turbogs_plugin.types import Gaussians
@@ -45,6 +45,18 @@ def finished(capture, tmp_path_factory) -> Path:
     return run.train(config, tmp_path_factory.mktemp("given-runs") / "run").folder.path
 
 
+@pytest.fixture(scope="module")
+def trained(finished) -> Gaussians:
+    """Its model, in the frame of its scene. Not to be changed."""
+    return load_model(finished, CPU).gaussians
+
+
+@pytest.fixture
+def model(finished) -> Gaussians:
+    """As it was written, in the capture's coordinates."""
+    return read_ply(finished / "model.ply")
+
+
 def save_splats(path: Path, gaussians: Gaussians, **others) -> Path:
     """As gsplat's simple_trainer does: the state of a ParameterDict."""
     splats = torch.nn.ParameterDict({name: torch.nn.Parameter(value.float()) for name, value in gaussians.items()})
@@ -54,11 +66,9 @@ def save_splats(path: Path, gaussians: Gaussians, **others) -> Path:
 
 def worlds_of(capture: Path):
     """gsplat's worlds, from what pycolmap reads."""
-    model = load_pycolmap().Reconstruction(capture / "sparse/0")
-    viewmats = np.tile(np.eye(4), (model.num_images(), 1, 1))
-    for i, image in enumerate(model.images.values()):
-        viewmats[i, :3] = image.cam_from_world().matrix()
-    return gsplat_worlds(viewmats, np.array([point.xyz for point in model.points3D.values()]))
+    solved = load_pycolmap().Reconstruction(capture / "sparse/0")
+    viewmats = [np.r_[image.cam_from_world().matrix(), [[0, 0, 0, 1]]] for image in solved.images.values()]
+    return gsplat_worlds(np.array(viewmats), np.array([point.xyz for point in solved.points3D.values()]))
 
 
 def table(text: str) -> str:
@@ -71,10 +81,10 @@ def assert_alike(a: Gaussians, b: Gaussians) -> None:
         torch.testing.assert_close(value, other, msg=name, rtol=1e-4, atol=1e-5)
 
 
-def test_a_given_model_has_the_tables_and_pictures_of_its_run(turbogs, finished, capture, tmp_path):
+def test_a_given_model_has_the_tables_and_pictures_of_its_run(turbogs, finished, model, capture, tmp_path):
     """In every form in which it can be given: ours, gsplat's two, a checkpoint, a run."""
     asked, pictures = table(turbogs("eval", finished, "--device", "cpu")[1]), tmp_path / "pictures"
-    model, theirs = read_ply(finished / "model.ply"), tmp_path / "gsplat.ply"
+    theirs = tmp_path / "gsplat.ply"
     export_splats(**{name: value.float() for name, value in model.items()}, save_to=str(theirs))
     pt, checkpoint = save_splats(tmp_path / "ckpt_6999_rank0.pt", model), latest_checkpoint(finished / "checkpoints")
     for file in (finished / "model.ply", theirs, pt, checkpoint, finished):
@@ -91,131 +101,112 @@ def test_a_given_model_has_the_tables_and_pictures_of_its_run(turbogs, finished,
 
 
 @pytest.mark.parametrize("world", range(4))
-def test_a_model_of_gsplats_normalised_world_is_brought_back(finished, capture, tmp_path, world):
+def test_a_model_of_gsplats_normalised_world_is_brought_back(trained, model, scene, capture, tmp_path, world):
     """Whichever half turn gsplat's version and linear algebra made of it."""
-    theirs = worlds_of(capture)[world].apply(read_ply(finished / "model.ply"))
-    file = save_splats(tmp_path / "ckpt.pt", theirs)
-    loaded = load_given(file, load_scene(capture), "gsplat")
-    trained = load_model(finished, CPU).gaussians
+    loaded = load_given(save_splats(tmp_path / "ckpt.pt", worlds_of(capture)[world].apply(model)), scene, "gsplat")
     for name in ("means", "scales", "opacities", "sh0", "shN"):
         torch.testing.assert_close(getattr(loaded, name), getattr(trained, name), rtol=1e-3, atol=1e-3)
     aligned = torch.nn.functional.cosine_similarity(loaded.quats, trained.quats).abs()
     torch.testing.assert_close(aligned, torch.ones_like(aligned))
 
 
-def test_the_world_is_said_by_a_setting_in_training_and_evaluation(turbogs, finished, capture, tmp_path):
-    file = save_splats(tmp_path / "ckpt.pt", worlds_of(capture)[2].apply(read_ply(finished / "model.ply")))
-    start = tiny_trainer(capture, f"train.init={file}", "train.init_world=gsplat", "train.sh_degree=1").gaussians
-    trained = load_model(finished, CPU).gaussians
+def test_the_world_is_said_by_a_setting_in_training_and_evaluation(turbogs, finished, trained, model, scene, tmp_path):
+    capture = run.RunFolder(finished).read_config().scene.path
+    file = save_splats(tmp_path / "ckpt.pt", worlds_of(Path(capture))[2].apply(model))
+    start = tiny_trainer(scene, f"train.init={file}", "train.init_world=gsplat", "train.sh_degree=1").gaussians
     torch.testing.assert_close(start.means, trained.means, atol=1e-3, rtol=0)
     calls = (("eval", file, "--scene", capture, "train.init_world=gsplat"), ("eval", finished))
     told = (turbogs(*call, "--device", "cpu")[1] for call in calls)
     measured, expected = (float(re.search(r"mean of 1\W+([\d.]+)", text)[1]) for text in told)
     assert measured == pytest.approx(expected, abs=0.2)
     checkpoint = latest_checkpoint(finished / "checkpoints")  # knows its frame
-    assert_alike(load_given(checkpoint, load_scene(capture), "gsplat"), trained)
+    assert_alike(load_given(checkpoint, scene, "gsplat"), trained)
 
 
 @pytest.mark.parametrize("turn", TURNS)
-def test_nerfstudios_file_beside_a_model_brings_it_back(finished, capture, tmp_path, turn):
+def test_nerfstudios_file_beside_a_model_brings_it_back(trained, model, scene, tmp_path, turn):
     """A model of COLMAP's own coordinates, of those of `ns-process-data`, or not of nerfstudio at all."""
-    scene, model = load_scene(capture), read_ply(finished / "model.ply")
     change = Similarity(Rotation.from_euler("xyz", (0.4, -1.1, 0.2)).as_matrix(), 0.3, np.array([0.1, -0.2, 0.3]))
     values = {"transform": np.c_[change.rotation, change.translation / 0.3].tolist(), "scale": 0.3}
     (tmp_path / TRANSFORMS).write_text(json.dumps(values))
     theirs = Similarity(turn, 1.0, np.zeros(3)).inverse()
     for given in (change.after(theirs).apply(model), model):
         loaded = load_given(save_splats(tmp_path / "a.pt", given), scene)
-        torch.testing.assert_close(loaded.means, load_model(finished, CPU).gaussians.means, rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(loaded.means, trained.means, rtol=1e-3, atol=1e-3)
     (tmp_path / TRANSFORMS).write_text(json.dumps(values | {"scale": 0}))
     with pytest.raises(InputError, match=TRANSFORMS):
         load_given(tmp_path / "a.pt", scene)
 
 
-def test_a_model_in_other_coordinates_is_said_not_to_fit(finished, capture, tmp_path, monkeypatch):
+def test_a_model_in_other_coordinates_is_said_not_to_fit(model, scene, tmp_path, monkeypatch):
     monkeypatch.setattr(placement, "FEWEST_POINTS", 50)
     monkeypatch.setattr(placement, "FARTHEST_POINTS", 0.3)  # of a tiny capture, whose points lie far apart
     change = Similarity(Rotation.from_euler("x", 0.7).as_matrix(), 0.31, np.array([0.1, -0.2, 0.3]))
-    file = save_splats(tmp_path / "a.pt", change.apply(read_ply(finished / "model.ply")))
     with pytest.warns(UserWarning, match="does not fit the points"):
-        load_given(file, load_scene(capture))
+        load_given(save_splats(tmp_path / "a.pt", change.apply(model)), scene)
 
 
-def test_the_spz_of_splat_transform_is_turned_back(finished, capture, tmp_path):
-    turned = Similarity(np.diag([-1.0, 1.0, -1.0]), 1.0, np.zeros(3)).apply(read_ply(finished / "model.ply"))
-    scene, origin = load_scene(capture), Frame(np.zeros(3), 1.0)
-    for number, model in enumerate((turned, read_ply(finished / "model.ply"))):
-        save_spz(model.map(torch.Tensor.float), tmp_path / f"{number}.spz", origin)
-        loaded = load_given(tmp_path / f"{number}.spz", scene)
-        assert (loaded.means - load_model(finished, CPU).gaussians.means).abs().max() < 1e-3
+def test_the_spz_of_splat_transform_is_turned_back(trained, model, scene, tmp_path):
+    turned = Similarity(np.diag([-1.0, 1.0, -1.0]), 1.0, np.zeros(3)).apply(model)
+    for given in (turned, model):
+        save_spz(given.map(torch.Tensor.float), tmp_path / "a.spz", Frame(np.zeros(3), 1.0))
+        assert (load_given(tmp_path / "a.spz", scene).means - trained.means).abs().max() < 1e-3
 
 
-def test_a_model_of_antialiased_training_is_drawn_as_it_was_trained(finished, capture, tmp_path):
-    saved, scene = load_model(finished, CPU), load_scene(capture)
-    save_ply(saved.gaussians, tmp_path / "a.ply", saved.frame, antialiased=True)
+def test_a_model_of_antialiased_training_is_drawn_as_it_was_trained(trained, scene, capture, tmp_path):
+    save_ply(trained, tmp_path / "a.ply", scene.frame, antialiased=True)
     state = open_state(tmp_path / "a.ply", CPU, GivenOptions(scene=capture).settings(()))
     seen = render_image(state.gaussians, scene.test.cameras, **state.look.options).colors
     rows = drawable_rows(state.gaussians, scene.test.cameras, state.look.settings)
     splats = project_rows(rows, rows.take(state.gaussians), scene.test.cameras, 0, state.look.settings)
     thinner = rows.take(state.gaussians)
     thinner.opacities, thinner.shN = torch.logit(splats.opacities * splats.shares), thinner.shN[rows.gaussians]
-    expected = render_image(thinner, scene.test.cameras, **state.look.options | {"antialiased": False}).colors
-    torch.testing.assert_close(seen, expected)
-    plain = render_image(state.gaussians, scene.test.cameras, **state.look.options | {"antialiased": False}).colors
-    assert (seen - plain).abs().max() > 0.01
+    plainly = state.look.options | {"antialiased": False}
+    torch.testing.assert_close(seen, render_image(thinner, scene.test.cameras, **plainly).colors)
+    assert (seen - render_image(state.gaussians, scene.test.cameras, **plainly).colors).abs().max() > 0.01
     with pytest.warns(UserWarning, match="antialiased training"):
         tiny_trainer(scene, f"train.init={tmp_path / 'a.ply'}")
 
 
-def test_the_newest_model_in_folders_of_other_trainers(finished, capture, tmp_path, turbogs):
+def test_the_newest_model_in_folders_of_other_trainers(model, scene, tmp_path):
     for folder, name in (("inria/point_cloud/iteration_{}", "point_cloud.ply"), ("gsplat/ckpts", "ckpt_{}_rank0.pt")):
         for number, count in ((7000, 5), (30000, 9)):
             file = tmp_path / folder.format(number) / name.format(number)
             file.parent.mkdir(parents=True, exist_ok=True)
-            model = read_ply(finished / "model.ply").map(lambda value, count=count: value[:count])
-            save_splats(file, model) if file.suffix == ".pt" else save_ply(model.map(torch.Tensor.float), file)
+            part = model.map(lambda value, count=count: value[:count].float())
+            save_splats(file, part) if file.suffix == ".pt" else save_ply(part, file)
         found = tmp_path / folder.partition("/")[0]
-        assert len(load_given(found, load_scene(capture))) == 9
+        assert len(load_given(found, scene)) == 9
         assert open_state(found, CPU).gaussians.means.shape[0] == 9
 
 
-def test_rows_that_are_not_finite_are_left_out_and_counted_once(finished, capture, tmp_path):
-    model = read_ply(finished / "model.ply")
+def test_rows_that_are_not_finite_are_left_out_and_counted_once(trained, model, scene, tmp_path):
     kept = torch.ones(len(model), dtype=torch.bool)
     kept[[2, 5, 9]] = False
     model.means[2, 1], model.opacities[5], model.shN[9, 0, 0] = torch.nan, torch.nan, -torch.inf
     file = save_splats(tmp_path / "ckpt.pt", model)
     with pytest.warns(UserWarning) as warned:
-        loaded = load_given(file, load_scene(capture))
+        loaded = load_given(file, scene)
     assert [str(w.message) for w in warned] == [f"{file}: 3 of {len(model)} Gaussians are not finite and left out"]
-    assert_alike(loaded, load_model(finished, CPU).gaussians.map(lambda value: value[kept]))
+    assert_alike(loaded, trained.map(lambda value: value[kept]))
 
 
-def test_ranks_of_one_model_are_put_together(finished, capture, tmp_path):
-    model = read_ply(finished / "model.ply")
+def test_ranks_of_one_model_are_put_together(trained, model, scene, tmp_path):
     half = len(model) // 2
     first = save_splats(tmp_path / "ckpt_6999_rank0.pt", model.map(lambda value: value[:half]))
     save_splats(tmp_path / "ckpt_6999_rank1.pt", model.map(lambda value: value[half:]))
     save_splats(tmp_path / "ckpt_29999_rank1.pt", model)
-    assert_alike(load_given(first, load_scene(capture)), load_model(finished, CPU).gaussians)
+    assert_alike(load_given(first, scene), trained)
 
 
-def test_training_starts_from_a_model_where_that_had_ended(finished, capture, tmp_path):
-    before = load_model(finished, CPU)
-    config = tiny_config(capture, "train.iterations=1", "train.evaluate_at=[]")
-    config.train.init = str(finished / "model.ply")
-    session = run.train(config, tmp_path / "run")
-    assert len(session.trainer.gaussians) == len(before.gaussians)
-    ended = run.RunFolder(finished).history.read_text().splitlines()[-1]
-    assert session.history[0].psnr == pytest.approx(float(re.search(r'"psnr": ([\d.]+)', ended)[1]), abs=0.01)
-    assert Path(run.RunFolder(tmp_path / "run").read_config().train.init) == finished / "model.ply"
-
-
-def test_a_stopped_run_goes_on_without_the_model_that_it_started_from(finished, capture, tmp_path):
+def test_training_starts_from_a_model_where_that_had_ended_and_goes_on_without_it(finished, capture, tmp_path):
     start = Path(shutil.copy(finished / "model.ply", tmp_path / "start.ply"))
     short = ("train.iterations=6", "train.refine_until=5", "train.checkpoint_every=3", "train.evaluate_at=[]")
-    config = tiny_config(capture, f"train.init={start}", "train.sh_degree=1", *short)
-    whole = run.train(config, tmp_path / "whole")
+    whole = run.train(tiny_config(capture, f"train.init={start}", *short), tmp_path / "whole")
+    ended = read_history(finished / "history.jsonl")[-1]
+    assert whole.history[0].psnr == pytest.approx(ended.psnr, abs=0.01)
+    assert whole.history[0].num_gaussians == ended.num_gaussians
+    assert Path(whole.folder.read_config().train.init) == start
     shutil.copytree(tmp_path / "whole", tmp_path / "stopped")
     (tmp_path / "stopped/checkpoints/iteration-000006.pt").unlink()
     start.unlink()
@@ -224,62 +215,53 @@ def test_a_stopped_run_goes_on_without_the_model_that_it_started_from(finished, 
     assert_identical(dict(whole.trainer.gaussians.items()), dict(resumed.trainer.gaussians.items()))
 
 
-def test_a_model_that_is_larger_than_the_cap_is_refused(finished, capture):
+def test_a_model_that_is_larger_than_the_cap_is_refused(finished, scene):
     with pytest.raises(InputError, match=r"more than density\.max_gaussians 100 allows.*start from points"):
-        tiny_trainer(capture, f"train.init={finished}", "density.max_gaussians=100")
+        tiny_trainer(scene, f"train.init={finished}", "density.max_gaussians=100")
 
 
-def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
-    """What -> (a file, words of the answer)."""
-
-    def written(name: str, content: bytes) -> Path:
-        (folder / name).write_bytes(content)
-        return folder / name
-
-    def saved(name: str, value: object) -> Path:
-        torch.save(value, folder / name)
-        return folder / name
-
-    empty = folder / "empty"
-    empty.mkdir()
-    broken = random_gaussians(5).map(lambda value: value * torch.nan)
-    return {
-        "absent": (folder / "absent.ply", "no such model"),
-        "another kind": (written("model.obj", b"x"), "a .ply, .spz or gsplat's .pt"),
-        "empty folder": (empty, "without a checkpoint of a run"),
-        "other keys": (saved("weights.pt", {"conv1": torch.zeros(3), "bias": torch.zeros(1)}), "bias, conv1"),
-        "code": (saved("code.pt", {"splats": Path("x")}), "more than plain tensors"),
-        "not finite": (save_splats(folder / "nan.pt", broken), "none of its 5 Gaussians is finite"),
-        "PlayCanvas's": (written("m.sog", b"x"), "splat-transform"),
-        "nerfstudio's": (written("m.ckpt", b"x"), "ns-export"),
-        "Inria's": (written("m.pth", b"x"), "point_cloud.ply"),
-        "not a spz": (written("text.spz", b"text"), "cannot read"),
-    }
+BAD_FILES = {
+    "absent.ply": (None, "no such model"),
+    "model.obj": (b"x", "a .ply, .spz or gsplat's .pt"),
+    "empty": ("a folder", "without a checkpoint of a run"),
+    "weights.pt": ({"conv1": torch.zeros(3), "bias": torch.zeros(1)}, "bias, conv1"),
+    "code.pt": ({"splats": Path("x")}, "more than plain tensors"),
+    "nan.pt": ({"splats": dict(random_gaussians(5).map(lambda value: value * torch.nan).items())}, "none of its 5"),
+    "m.sog": (b"x", "splat-transform"),
+    "m.ckpt": (b"x", "ns-export"),
+    "m.pth": (b"x", "point_cloud.ply"),
+    "text.spz": (b"text", "cannot read"),
+}
+"""Name -> what is in it, and words of the answer."""
 
 
-def test_what_is_no_model_is_one_line(turbogs, capture, tmp_path):
-    out = tmp_path / "out"
-    for what, (file, words) in bad_files(tmp_path).items():
-        calls = [("eval", file, "--scene", capture)]
-        if what == "absent":
-            calls += [("train", capture, "--init", file, "--out", out)]
-            calls += [(verb, file, "--scene", capture, "--out", f"{out}.ply") for verb in ("render", "export")]
-        for call in calls:
-            code, printed, error = turbogs(*call)
-            assert code == 2 and printed == "" and error.count("\n") == 1, (what, call[0], error)
-            assert words in error and str(file) in error, (what, error)
-            assert not list(tmp_path.glob("out*"))
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_what_is_no_model_is_one_line(turbogs, capture, tmp_path, name):
+    (content, words), file, out = BAD_FILES[name], tmp_path / name, tmp_path / "out"
+    if isinstance(content, bytes):
+        file.write_bytes(content)
+    elif content == "a folder":
+        file.mkdir()
+    elif content is not None:
+        torch.save(content, file)
+    calls = [("eval", file, "--scene", capture)]
+    if content is None:
+        calls += [("train", capture, "--init", file, "--out", out)]
+        calls += [(verb, file, "--scene", capture, "--out", f"{out}.ply") for verb in ("render", "export")]
+    for call in calls:
+        code, printed, error = turbogs(*call)
+        assert code == 2 and printed == "" and error.count("\n") == 1, (call[0], error)
+        assert words in error and str(file) in error
+        assert not list(tmp_path.glob("out*"))
 
 
 @pytest.mark.parametrize(("shift", "refused"), [(0.0, False), (100.0, True)])
-def test_a_plain_cloud_is_a_start(capture, tmp_path, shift, refused):
+def test_a_plain_cloud_is_a_start(capture, scene, tmp_path, shift, refused):
     """A Gaussian for each finite point, in the capture's coordinates; a cloud in another frame is refused."""
-    scene = load_scene(capture)
     points = np.repeat(scene.frame.restore_points(scene.points.numpy()) + shift, 2, axis=0)
     colors = np.repeat(scene.point_colors.numpy(), 2, axis=0)
-    trimesh.PointCloud(np.concatenate([points, [[np.nan] * 3]]), np.concatenate([colors, [[1, 2, 3]]])).export(
-        tmp_path / "lidar.ply"
-    )
+    cloud = trimesh.PointCloud(np.r_[points, [[np.nan] * 3]], np.r_[colors, [[1, 2, 3]]])
+    cloud.export(tmp_path / "lidar.ply")
     config = tiny_config(capture, f"train.init={tmp_path / 'lidar.ply'}").without_plan()
     if refused:
         with pytest.raises(InputError, match="the cameras see no points"):

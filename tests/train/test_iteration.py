@@ -6,10 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers.framework_runs import tiny_capture, tiny_trainer
+from helpers.framework_runs import tiny_trainer
 from torch import Tensor
 
-from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.reference.raster import kept
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.engine.rules import Dropout
@@ -21,11 +20,6 @@ from turbogs_plugin.types import RowUpdate
 CPU = torch.device("cpu")
 HALF = 2e-3
 """Errors are kept in half precision, and are up to 3."""
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return load_scene(tiny_capture(tmp_path_factory.mktemp("iteration")))
 
 
 def dense_errors(trainer: Trainer, degree: int) -> list[Tensor]:
@@ -44,7 +38,6 @@ def mapped_errors(trainer: Trainer) -> list[Tensor]:
 
 def test_the_maps_begin_with_the_errors_of_the_initial_model(scene):
     trainer = tiny_trainer(scene)
-    trainer.initialise_maps()
     expected = dense_errors(trainer, degree=0)
     for found, errors in zip(mapped_errors(trainer), expected, strict=True):
         torch.testing.assert_close(found, errors, rtol=0, atol=HALF)
@@ -55,7 +48,6 @@ def test_an_iteration_learns_the_errors_of_the_views_that_it_drew(scene):
     """With beta = 1 the maps then hold, at the pixels drawn, what a dense render of the model before the step gives,
     with the bands in use at that iteration; and elsewhere what they held."""
     trainer = tiny_trainer(scene, "maps.beta=1")
-    trainer.initialise_maps()
     generator = torch.Generator().manual_seed(0)
     trainer.gaussians.shN += 0.2 * torch.randn(trainer.gaussians.shN.shape, generator=generator)
     trainer.gaussians.sh0 += 0.3
@@ -87,7 +79,6 @@ def test_iterations_before_a_change_of_the_set_are_not_made_again(scene):
 
 def test_lost_iterations_are_made_again(scene):
     trainer, seen = tiny_trainer(scene), []
-    trainer.initialise_maps()
     trainer.on_samples = lambda _: seen.append(trainer.iteration)
     trainer.refine = lambda step: None  # no change of the set, before which none is made again
     settle, lost = trainer.engine.settle, {5: 3, 6: 1}
@@ -113,7 +104,6 @@ def test_an_evaluation_measures_what_a_screen_shows(scene):
 def test_what_an_iteration_leaves_out_does_not_learn_and_the_end_has_all(scene, monkeypatch):
     still = ("density.refine_from=1000", "density.final_keep=1", "train.distant_size=0")
     trainer = tiny_trainer(scene, "train.dropout=0.4", "train.iterations=20", *still)
-    trainer.initialise_maps()
     render, shares = trainer.engine.render, []
     monkeypatch.setattr(trainer.engine, "render", lambda *all: shares.append(all[3].dropout.share) or render(*all))
     ever_left = torch.zeros(len(trainer.gaussians), dtype=torch.bool)

@@ -45,12 +45,6 @@ class OwnCode:
         self.inner.setup(gaussians)
 
 
-def make_trainer(capture):
-    trainer = tiny_trainer(capture)
-    trainer.initialise_maps()
-    return trainer
-
-
 def run(trainer, iterations=3):
     for _ in range(iterations):
         trainer.step()
@@ -71,14 +65,14 @@ def assert_equal_statistics(one, other):
 
 
 def test_a_loss_of_its_own_code_trains_as_its_rule_would(capture):
-    ruled, coded = make_trainer(capture), make_trainer(capture)
+    ruled, coded = tiny_trainer(capture), tiny_trainer(capture)
     coded.loss = OwnCodeLoss(ruled.loss)
     assert_equal(run(ruled), run(coded))
 
 
 @pytest.mark.parametrize("make", [MomentLMOptimizer, SparseAdam])
 def test_an_optimizer_of_its_own_code_trains_as_its_rule_would(capture, make):
-    ruled, coded = make_trainer(capture), make_trainer(capture)
+    ruled, coded = tiny_trainer(capture), tiny_trainer(capture)
     for trainer, optimizer in ((ruled, make()), (coded, OwnCode(make()))):
         trainer.optimizer = optimizer
         optimizer.setup(trainer.gaussians)
@@ -90,7 +84,7 @@ def test_an_optimizer_of_its_own_code_trains_as_its_rule_would(capture, make):
 @pytest.mark.parametrize("calls", [0, 2])
 def test_statistics_are_written_once_whatever_the_optimizer_does(capture, calls):
     """Statistics of density control get each backward pass once, whether an optimizer makes no step of it or two."""
-    usual, odd = make_trainer(capture), make_trainer(capture)
+    usual, odd = tiny_trainer(capture), tiny_trainer(capture)
     odd.optimizer = OwnCode(MomentLMOptimizer())
     odd.optimizer.calls = calls
     odd.optimizer.setup(odd.gaussians)
@@ -116,7 +110,7 @@ class Restless:
 
 
 def test_what_density_control_moves_in_a_skipped_iteration_is_taken_back(capture):
-    trainer = make_trainer(capture)
+    trainer = tiny_trainer(capture)
     trainer.engine, trainer.density = LosingEngine(lose=2), Restless()
     run(trainer, 1)
     before = trainer.gaussians.map(torch.Tensor.clone)

@@ -105,13 +105,8 @@ def test_a_run_stopped_again_and_again_is_the_same_bit_for_bit(capture, whole, t
     config = tiny_config(capture).without_plan()
     trainer = Trainer(config, open_scene(config.scene, True), torch.device("cpu"))
     initialise, place = Trainer.initialise_maps, tmp_path / "run"
-
-    def interrupted(trainer):
-        initialise(trainer)
-        signal.raise_signal(signal.SIGINT)
-
     with monkeypatch.context() as context:
-        context.setattr(Trainer, "initialise_maps", interrupted)
+        context.setattr(Trainer, "initialise_maps", lambda each: (initialise(each), signal.raise_signal(signal.SIGINT)))
         assert run.train(tiny_config(capture), place).signal == signal.SIGINT
     trainer.initialise_maps()
     assert_identical(trainer.state_dict(), saved(place))
@@ -162,23 +157,17 @@ def test_a_run_stops_and_saves_when_its_terminal_closes(capture, tmp_path):
     assert latest_checkpoint(tmp_path / "run" / "checkpoints") is not None
 
 
-def killed_at_7(capture: Path, out: Path) -> None:
+def killed(capture: Path, out: Path, iteration: int) -> None:
     """In a process of its own: a run that is killed."""
-    step = Trainer.step
-
-    def killed(trainer):
-        step(trainer)
-        if trainer.iteration == 7:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    Trainer.step = killed
+    stop_after(pytest.MonkeyPatch(), iteration, lambda trainer: os.kill(os.getpid(), signal.SIGKILL))
     run.train(tiny_config(capture, "train.checkpoint_every=2"), out)
 
 
-def test_a_run_killed_without_notice_resumes_bit_for_bit(capture, whole, tmp_path):
-    """Between two checkpoints. What a kill in the midst of one leaves behind: test_checkpoint.py."""
-    assert ended(start_ranks(1, killed_at_7, tmp_path, capture, tmp_path / "run")) == [-signal.SIGKILL]
-    assert saved(tmp_path / "run")["iteration"] == 6
+@pytest.mark.parametrize(("iteration", "kept"), [(1, 0), (7, 6)])
+def test_a_run_killed_without_notice_resumes_bit_for_bit(capture, whole, tmp_path, iteration, kept):
+    """Before the first checkpoint, and between two. What a kill in the midst of one leaves: test_checkpoint.py."""
+    assert ended(start_ranks(1, killed, tmp_path, capture, tmp_path / "run", iteration)) == [-signal.SIGKILL]
+    assert not kept or saved(tmp_path / "run")["iteration"] == kept
     run.resume(tmp_path / "run")
     assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
 
@@ -217,18 +206,6 @@ def terminated(capture: Path) -> None:
 def test_sigterm_before_training_ends_the_process_without_a_trace(capture, tmp_path):
     """pycolmap brings a handler that prints one."""
     assert ended(start_ranks(1, terminated, tmp_path, capture)) == [-signal.SIGTERM] and said(tmp_path) == ""
-
-
-def test_a_run_without_a_checkpoint_starts_again(capture, whole, tmp_path, monkeypatch):
-    def die(trainer):
-        raise MemoryError
-
-    with monkeypatch.context() as context:
-        stop_after(context, 2, die)
-        with pytest.raises(MemoryError):
-            run.train(tiny_config(capture), tmp_path / "run")
-    run.resume(tmp_path / "run")
-    assert_identical(saved(whole.folder.path), saved(tmp_path / "run"))
 
 
 def not_finite(trainer):
@@ -293,7 +270,6 @@ def test_a_capture_made_anew_since_the_run_began_is_refused(capture, whole, tmp_
 @pytest.mark.parametrize(("size", "expected"), [(0.0, 40.0), (0.3, 0.3 * 14.0)])
 def test_what_is_far_is_kept_from_growing(capture, size, expected):
     trainer = tiny_trainer(capture, f"train.distant_size={size}", "density.refine_from=100")
-    trainer.initialise_maps()
     far = trainer.gaussians.means.norm(dim=1).argmax()
     trainer.gaussians.means[far] *= 15.0 * trainer.extent / trainer.gaussians.means[far].norm()
     trainer.gaussians.scales[far] = math.log(40.0 * trainer.extent)
@@ -304,7 +280,6 @@ def test_what_is_far_is_kept_from_growing(capture, size, expected):
 @pytest.mark.parametrize(("clears", "drawn", "remain"), [(True, False, 0), (False, False, 3), (True, True, 3)])
 def test_what_stands_before_a_camera_goes_with_the_next_change(capture, clears, drawn, remain):
     trainer = tiny_trainer(replace(load_scene(capture), drawn_points=drawn), f"train.camera_clearance={clears}")
-    trainer.initialise_maps()
     centers = trainer.views.cameras.centers
     trainer.gaussians.means[:3] = centers[:3] + 1e-3 * trainer.extent
     trainer.follow(RowUpdate(torch.arange(len(trainer.gaussians)), torch.zeros(len(trainer.gaussians)).bool(), {}))
@@ -338,10 +313,8 @@ def test_more_views_an_iteration_than_a_gpu_takes_are_refused_before_anything_is
 
 
 class OwnSampler(PixelSampler):
-    """A sampler that forgets which views it was asked for."""
-
     def sample(self, maps, view_ids, rate, step):
-        return PixelSamples.from_mask(torch.ones(len(view_ids), 24, 40, dtype=torch.bool))
+        return PixelSamples.from_mask(torch.ones(len(view_ids), 24, 40, dtype=torch.bool))  # of which views?
 
 
 class OwnLoss(SparseLoss):

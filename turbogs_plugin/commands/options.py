@@ -91,9 +91,8 @@ class GivenOptions:
                 raise InputError("a run uses its own configuration: --factor and overrides need --scene")
             return None
         asked = RunOptions(factor=self.factor).settings(self.scene, overrides)
-        decided = asked.without_plan()
-        decided.train.background = asked.train.background  # auto goes by the photos, as in a run
-        return decided
+        background = {"background": asked.train.background}  # auto goes by the photos, as in a run
+        return asked.without_plan().changed(train=background)
 
 
 Given = Annotated[GivenOptions, arg(name="")]

@@ -59,10 +59,10 @@ def train(
         if scene or overrides or out or options != NO_OPTIONS:
             others = "--no-report, --viewer, --gpus and --trust"
             raise InputError(f"--resume goes on by the run's own configuration: give it nothing else but {others}")
-    elif scene is None or out is None:
-        raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
     elif trust:
         raise InputError("--trust is for --resume: a configuration that you name yourself is your own word")
+    if (target := resume or out) is None or (scene or resume) is None:
+        raise InputError("train needs a SCENE and --out RUN, or --resume RUN")
     require_positive("--gpus", gpus)
     if viewer is not None and (gpus or 1) > 1:
         raise InputError(VIEWER_ON_ONE)
@@ -72,8 +72,6 @@ def train(
     from turbogs_plugin.train import run
 
     gc.freeze()  # collections during training pass over the imports' objects
-    target = resume or out
-    assert target is not None  # one of them is named
     folder = run.RunFolder(target)
     settings = options.settings(scene, overrides) if resume is None else folder.read_config()
     if resume and viewer is None and folder.finished(report):
@@ -162,8 +160,7 @@ def _tell(session: RunSession, reported: bool) -> int:
     if session.signal is not None:
         print(f"stopped and saved: go on with  turbogs train --resume {shlex.quote(str(folder.path))}", file=sys.stderr)
         return 128 + session.signal
-    print(history_table(session.history))
-    print(f"\n{session.wall.text()}")
+    print(f"{history_table(session.history)}\n\n{session.wall.text()}")
     if reported:
         print(f"report  {folder.report}\nrenders {folder.path / 'report'}")
     print(f"model   {folder.model}")

@@ -123,8 +123,8 @@ def wanted_dropout(facts: SceneFacts, config: Config) -> Verdict:
     if error is None:
         return 0.0, "no reconstruction says how accurate the cameras are"
     inaccurate = error >= CAMERA_PIXELS
-    sign = _sign(inaccurate)
-    return DROPOUT * inaccurate, f"points {error:.2f} pixels from where photos show them {sign} {CAMERA_PIXELS}"
+    reason = f"points {error:.2f} pixels from where photos show them {_sign(inaccurate)} {CAMERA_PIXELS}"
+    return DROPOUT if inaccurate else 0.0, reason
 
 
 def wanted_batch_for(facts: SceneFacts, config: Config) -> tuple[int, str]:

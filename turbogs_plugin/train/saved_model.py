@@ -41,8 +41,12 @@ _OTHERS = {
     "pth": "give the point_cloud/iteration_N/point_cloud.ply of its training",
 }
 """Suffixes of models that are not read -> how to make a `.ply` of one."""
-_INRIA, _GSPLAT = "point_cloud/iteration_*/point_cloud.ply", "ckpts/ckpt_*_rank0.pt"
-_FOLDERS = ("checkpoints/iteration-*.pt", _INRIA, _GSPLAT, "ply/*.ply")
+_FOLDERS = [
+    "checkpoints/iteration-*.pt",
+    "point_cloud/iteration_*/point_cloud.ply",
+    "ckpts/ckpt_*_rank0.pt",
+    "ply/*.ply",
+]
 """Models in folders of trainings: of TurboGS, Inria's 3DGS and gsplat."""
 
 
@@ -131,8 +135,9 @@ def require_model(path: str | Path) -> Path:
     if not path.is_file():
         raise InputError(f"no such model '{path}': give {KINDS}")
     kind = path.suffix.lower().removeprefix(".")
-    for remedy in (remedy for kinds, remedy in _OTHERS.items() if kind in kinds.split()):
-        raise InputError(f"'{path}' is a .{kind}, which is not read: {remedy.format(path)}")
+    others = {other: remedy for kinds, remedy in _OTHERS.items() for other in kinds.split()}
+    if kind in others:
+        raise InputError(f"'{path}' is a .{kind}, which is not read: {others[kind].format(path)}")
     if kind not in FORMATS:
         raise InputError(f"'{path}' is no model: give {KINDS}")
     return path

@@ -171,8 +171,8 @@ class TrainingState:
         one and those after it change nothing until the engine is settled. They are made again, with views chosen anew,
         but for those before a change of the set of Gaussians, which would then be made twice.
 
-        With `wait`, it waits for the GPU, to know of all of them. Raises `InputError` where an iteration has more
-        intersections of a tile and a splat than a pass can have.
+        `wait`: wait for the GPU, to know of all of them. Raises `InputError` where an iteration has more intersections
+        of a tile and a splat than a pass can have.
         """
         lost, last = self.engine.settle(wait), self.iteration
         self.iteration = max(last - lost, min(self._earliest, last))
