@@ -50,7 +50,7 @@ def seen_views(shares: list[Share], views: int) -> list[int]:
 def test_shares_are_the_samples_in_their_order(sizes, views, count, unit, masked):
     samples = samples_of(sizes, views, unit, masks=half_masked(sizes) if masked else None)
     shares = shares_of(samples, count)
-    assert len(shares) == count
+    assert len(shares) == count and shares == shares_of(replace(samples, host_ends=None), count)
     parts = [samples.of_tiles(share.tiles, share.views, share.slots) for share in shares if len(share)]
     assert torch.equal(torch.cat([part.pixel_ids for part in parts]), samples.pixel_ids)
     assert seen_views(shares, views) == list(range(views))
@@ -85,7 +85,7 @@ def test_a_view_without_samples_is_begun_once(empty, count):
 
 
 @pytest.mark.parametrize("unit", ["pixel", "tile"])
-@pytest.mark.parametrize("rate", [0.004, 0.3, 1.0])
+@pytest.mark.parametrize("rate", [0.004, 1.0])
 @pytest.mark.parametrize("masked", [False, True])
 def test_draws_know_their_ends(unit, rate, masked):
     """Where masks leave some tiles alone, too: so no process waits for its device to share the samples out."""
