@@ -65,21 +65,16 @@ def training(config: Config, out: Path, trouble: str) -> None:
             """This process is killed before its exchange of this number."""
             calls = itertools.count()
 
-            def counted(method: Callable[..., object]) -> Callable[..., object]:
-                def call(*arguments: object, **options: object) -> object:
-                    if next(calls) == number:
-                        os.kill(os.getpid(), signal.SIGKILL)
-                    return method(*arguments, **options)
-
-                return call
+            def struck() -> None:
+                if next(calls) == number:
+                    os.kill(os.getpid(), signal.SIGKILL)
 
             for name in EXCHANGES:
-                setattr(ProcessRanks, name, counted(getattr(ProcessRanks, name)))
+                method = getattr(ProcessRanks, name)
+                setattr(ProcessRanks, name, lambda *given, method=method, **more: struck() or method(*given, **more))
 
-        if trouble == "memory" and last:
-            Trainer.step = without_memory
-        if trouble == "signal" and last:
-            Trainer.step = interrupted
+        if trouble in ("memory", "signal") and last:
+            Trainer.step = without_memory if trouble == "memory" else interrupted
         if trouble == "disk" and ranks.first:
             Trainer.step = full
         if trouble.startswith("killed at") and ranks.rank == int(trouble[-1]) % ranks.count:
@@ -150,19 +145,18 @@ def test_a_process_killed_at_a_random_moment_ends_all_with_one_line(seed, captur
         assert load_checkpoint(newest)["trainer"]["iteration"] in (5, 10)
 
 
-@pytest.mark.parametrize(
-    ("trouble", "message"),
-    [
-        ("memory", "iteration 4: the device's memory was too small"),
-        ("disk", "iteration 6: the checkpoint could not be written"),
-    ],
-    ids=["memory", "disk"],
-)
-def test_trouble_of_one_process_ends_all_with_its_own_line(trouble, message, capture, tmp_path):
+TROUBLES = {
+    "memory": "iteration 4: the device's memory was too small",
+    "disk": "iteration 6: the checkpoint could not be written",
+}
+
+
+@pytest.mark.parametrize("trouble", TROUBLES)
+def test_trouble_of_one_process_ends_all_with_its_own_line(trouble, capture, tmp_path):
     codes, text = trained(2, tmp_path, capture, trouble, "train.checkpoint_every=3")
-    assert all(code in (1, 2) for code in codes), (codes, text)
+    assert set(codes) <= {1, 2}, (codes, text)
     (line,) = errors_in(text)
-    assert message in line and "turbogs: error:" in line
+    assert TROUBLES[trouble] in line and "turbogs: error:" in line
     newest = latest_checkpoint(tmp_path / "run/checkpoints")
     assert f"the last good checkpoint is '{newest}'" in line and newest.name == "iteration-000003.pt"
     assert load_checkpoint(newest)["trainer"]["iteration"] == 3
@@ -248,10 +242,6 @@ def running(processes: list[int]) -> list[int]:
     return [process for process in processes if state(process)[0] not in "XZ"]
 
 
-def started_by(process: int) -> list[int]:
-    return sorted(int(path.name) for path in Path("/proc").glob("[0-9]*") if state(int(path.name))[1] == process)
-
-
 def left_after_its_kill(words: list[str], folder: Path, working: Callable[[], bool]) -> list[int]:
     """Start a command, and kill it alone as soon as its processes are `working`: which of them stay.
 
@@ -263,7 +253,8 @@ def left_after_its_kill(words: list[str], folder: Path, working: Callable[[], bo
     processes: list[int] = []
     try:
         assert comes_true(lambda: working() or launcher.poll() is not None, 2 * SECONDS), "it does not begin"
-        processes = started_by(launcher.pid)
+        everybody = sorted(int(path.name) for path in Path("/proc").glob("[0-9]*"))
+        processes = [process for process in everybody if state(process)[1] == launcher.pid]
         assert launcher.poll() is None and len(processes) >= 2, (folder / "told").read_text()
         os.kill(processes[-1], signal.SIGSTOP)
         launcher.kill()

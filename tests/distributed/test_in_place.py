@@ -15,7 +15,7 @@ from helpers.peer_files import KeepingEngine, PeerFiles
 from helpers.processes import ended, grouped, said, start_ranks
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.config.configuration import Config, load_config
+from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed import in_place, peer_memory, ranks_engine
 from turbogs_plugin.distributed.in_place import DRAWN, STEPPED, WRITTEN, InPlace
 from turbogs_plugin.distributed.messages import rows_of
@@ -47,19 +47,13 @@ STEPS = 5
 scene_of = cache(load_scene)  # a trainer only reads it
 
 
-@cache
-def config_of(capture: Path, overrides: tuple[str, ...]) -> Config:
-    config = load_config("turbogs", [*tiny_settings(*overrides), "train.device=cpu", *overrides])
-    config.scene.path = str(capture)
-    return config.without_plan()
-
-
 def trainer_of(
     capture: Path, ranks: ProcessRanks, files: PeerFiles, *overrides: str, engine: SharedEngine | None = None
 ) -> Trainer:
     """With memory of these files, and an engine that keeps passes there."""
     engine = RanksEngine(engine or KeepingEngine(), ranks, CPU, files)
-    trainer = Trainer(copy.deepcopy(config_of(capture, overrides)), scene_of(capture), CPU, engine=engine)
+    config = load_config("turbogs", [*tiny_settings(*overrides), "train.device=cpu", *overrides]).without_plan()
+    trainer = Trainer(config, scene_of(capture), CPU, engine=engine)
     trainer.initialise_maps()
     return trainer
 

@@ -142,21 +142,20 @@ def broken_ranks(capture: Path, ranks: ProcessRanks) -> dict:
     engine.render = render
     before = int(trainer.optimizer.skipped)
 
-    class Infinite:  # a backward pass whose records of the first Gaussians are lost
-        def __init__(self, rendered):
-            self.rendered = rendered
+    def infinite_render(*arguments):  # in whose backward pass the records of the first Gaussians are lost
+        rendered = render(*arguments)
+        backward = rendered.backward
 
-        def __getattr__(self, name):
-            return getattr(self.rendered, name)
-
-        def backward(self, *arguments, **options):
-            screen = self.rendered.backward(*arguments, **options)
-            drawn = screen.records[:, 13] > 0
-            screen.records[drawn.nonzero()[:3, 0], 0] = torch.inf
+        def infinite(*given, **options):
+            screen = backward(*given, **options)
+            screen.records[(screen.records[:, 13] > 0).nonzero()[:3, 0], 0] = torch.inf
             return screen
 
+        rendered.backward = infinite
+        return rendered
+
     if ranks.rank == last:
-        engine.render = lambda *arguments: Infinite(render(*arguments))
+        engine.render = infinite_render
     compared_steps(trainer, 1)
     found["skipped"] = int(trainer.optimizer.skipped) - before
     engine.render = render

@@ -44,11 +44,15 @@ def seen_views(shares: list[Share], views: int) -> list[int]:
 
 
 @pytest.mark.parametrize("unit", ["pixel", "tile"])
-@pytest.mark.parametrize("count", [2, 3, 8])
+@pytest.mark.parametrize(("count", "rate"), [(2, 0.1), (3, 0.004), (8, 1.0)])
 @pytest.mark.parametrize(("sizes", "views"), [(EQUAL, 1), (EQUAL, 6), (MIXED, 3), (MIXED, 6)])
 @pytest.mark.parametrize("masked", [False, True])
-def test_shares_are_the_samples_in_their_order(sizes, views, count, unit, masked):
-    samples = samples_of(sizes, views, unit, masks=half_masked(sizes) if masked else None)
+def test_shares_are_the_samples_in_their_order(sizes, views, count, rate, unit, masked):
+    """Draws know their ends, where masks leave some tiles alone, too: no process waits for its device."""
+    samples, again = (samples_of(sizes, views, unit, rate, half_masked(sizes) if masked else None) for _ in range(2))
+    for given, asked in zip(samples.host_ends(), replace(samples, host_ends=None).ends(), strict=True):
+        np.testing.assert_array_equal(given, asked)
+    assert samples.host_ends == again.host_ends, "shares are kept by them"
     shares = shares_of(samples, count)
     assert len(shares) == count
     parts = [samples.of_tiles(share.tiles, share.views, share.slots) for share in shares if len(share)]
@@ -82,16 +86,3 @@ def test_a_view_without_samples_is_begun_once(empty, count):
     shares = shares_of(samples, count)
     assert seen_views(shares, 3) == [0, 1, 2]
     assert sum(share.num_slots for share in shares) == len(samples)
-
-
-@pytest.mark.parametrize("unit", ["pixel", "tile"])
-@pytest.mark.parametrize("rate", [0.004, 0.3, 1.0])
-@pytest.mark.parametrize("masked", [False, True])
-def test_draws_know_their_ends(unit, rate, masked):
-    """Where masks leave some tiles alone, too: so no process waits for its device to share the samples out."""
-    masks = half_masked(MIXED) if masked else None
-    samples = samples_of(MIXED, 5, unit, rate, masks)
-    for given, asked in zip(samples.host_ends(), replace(samples, host_ends=None).ends(), strict=True):
-        np.testing.assert_array_equal(given, asked)
-    assert samples.host_ends == samples_of(MIXED, 5, unit, rate, masks).host_ends, "shares are kept by them"
-    assert (len(samples.tile_ids) < len(samples_of(MIXED, 5, unit, rate).tile_ids)) == masked

@@ -5,9 +5,8 @@ import pytest
 import torch
 from helpers.rendering_scenes import dense_on_grid, make_cameras, make_gaussians, thin_out
 
-from turbogs_plugin.engine.reference.intersection import intersect_tiles, smallest_exponents
+from turbogs_plugin.engine.reference.intersection import intersect_tiles
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
-from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.engine.render_pass import RasterSettings
 
 SETTINGS = RasterSettings()
@@ -61,34 +60,3 @@ def test_no_contribution_is_lost_and_order_is_by_depth(dtype, shape, origin):
     # What is kept without contributing lies between two pixel centres.
     assert needed > 200
     assert found <= 1.1 * needed + 5
-
-
-def test_smallest_exponents_are_the_minimum_over_the_rectangle():
-    generator = torch.Generator().manual_seed(0)
-    factors = torch.randn(400, 2, 2, generator=generator, dtype=torch.float64)
-    matrices = factors @ factors.transpose(1, 2) + 0.01 * torch.eye(2, dtype=torch.float64)
-    conics = torch.stack([matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]], dim=-1)
-    low = 4 * torch.randn(400, 2, generator=generator, dtype=torch.float64)
-    high = low + 3 * torch.rand(400, 2, generator=generator, dtype=torch.float64)
-    shares = torch.linspace(0, 1, 201, dtype=torch.float64)
-    x = low[:, :1] + shares * (high - low)[:, :1]
-    y = low[:, 1:] + shares * (high - low)[:, 1:]
-    parts = []
-    for conic, across, down in zip(conics.split(20), x.split(20), y.split(20), strict=True):  # all take a gigabyte
-        a, b, c = conic[:, :, None, None].unbind(dim=1)
-        grid = 0.5 * (a * across[:, :, None] ** 2 + c * down[:, None] ** 2) + b * across[:, :, None] * down[:, None]
-        parts.append(grid.amin(dim=(1, 2)))
-    brute = torch.cat(parts)
-    found = smallest_exponents(conics, low, high)
-    assert (found <= brute + 1e-9).all()
-    assert (found >= brute - 0.02 * (1 + brute)).all()  # the brute search has a step
-
-
-def test_intersections_cover_every_row_once_when_summed():
-    gaussians, cameras = make_gaussians(50, degree=0), make_cameras([(70, 45)])
-    _, splats, intersections = intersections_of(gaussians, cameras, dense_samples(cameras))
-    values = torch.empty(len(intersections.rows), 1, dtype=torch.float64)
-    values[intersections.slots, 0] = (intersections.rows + 1).double()
-    counts = torch.bincount(intersections.rows, minlength=len(splats.depths))
-    expected = counts * torch.arange(1, len(counts) + 1)
-    assert torch.equal(intersections.sum_by_row(values)[:, 0], expected.double())

@@ -84,9 +84,8 @@ def test_batches_of_no_or_one_tile(tiles):
     exposures, _, colors, gradients = case(DEVICE)
     samples = dense_pixels((7,), SIZES[1:2], DEVICE)
     if not tiles:
-        samples.pixel_ids, samples.tile_ids, samples.tile_offsets = (
-            value[:count] for value, count in ((samples.pixel_ids, 0), (samples.tile_ids, 0), (samples.tile_offsets, 1))
-        )
+        samples.pixel_ids, samples.tile_ids = samples.pixel_ids[:0], samples.tile_ids[:0]
+        samples.tile_offsets = samples.tile_offsets[:1]
     colors, gradients = colors[: 256 * tiles].nan_to_num(0.5, posinf=0.5), gradients[: 256 * tiles]
     reference = copy.deepcopy(exposures)
     _, sums = exposure_gradients(reference, colors, gradients, samples)

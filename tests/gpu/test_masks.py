@@ -8,9 +8,8 @@ import torch
 from helpers.framework_runs import assert_iterations_wait_for_nothing, tiny_capture, tiny_config
 from helpers.raster_cases import (
     GPU_ONLY,
-    RECORD_COLUMNS,
     assert_forward_close,
-    assert_gradients_close,
+    assert_records_close,
     make_case,
     on_gpu,
     samples_to,
@@ -31,7 +30,6 @@ from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss, SparseSsimLoss
-from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Step
 
@@ -111,13 +109,10 @@ def test_a_background(with_depth, workspace):
     found = cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples, options, memory)
     expected = rasterize_reference(case.gaussians, case.cameras, case.samples, options)
     assert_forward_close(found.colors, expected.colors, "colors")
-    values = upstream(case)
-    if not with_depth:
-        del values["depth_gradients"]
+    values = upstream(case, with_depth)
     ours = found.backward(**on_gpu(values), with_statistics=True).full_records()
     theirs = expected.backward(**values, with_statistics=True).full_records()
-    for name, column in RECORD_COLUMNS.items():
-        assert_gradients_close(ours[..., column], theirs[..., column], name)
+    assert_records_close(ours, theirs)
 
 
 @pytest.mark.parametrize(
@@ -139,10 +134,8 @@ def test_the_loss_composites_transparent_photos(unit, loss):
     rendered = torch.rand(truth.shape, generator=generator).to(DEVICE)
     terms = loss.terms
     expected = training_kernels.sparse_loss(terms, rendered, truth, samples)
-    update = MapUpdate(maps, step)
-    found = training_kernels.sparse_loss(
-        terms, rendered, photos.colors.to(DEVICE), samples, update=update, background=COLOR
-    )
+    given = {"update": MapUpdate(maps, step), "background": COLOR}
+    found = training_kernels.sparse_loss(terms, rendered, photos.colors.to(DEVICE), samples, **given)
     largest = float(expected.color_gradients.abs().max())
     torch.testing.assert_close(found.color_gradients, expected.color_gradients, rtol=1e-5, atol=1e-4 * largest)
     torch.testing.assert_close(found.pixel_errors, expected.pixel_errors, rtol=1e-6, atol=5e-7)
@@ -164,27 +157,14 @@ def masked_capture(tmp_path_factory):
     return load_scene(capture)
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        (),
-        ("pixel_sampler.unit=tile",),
-        ("pixel_sampler.importance=0.5", "train.background=random"),
-    ],
-)
+WEIGHTED = ("pixel_sampler.importance=0.5", "train.background=random")
+
+
+@pytest.mark.parametrize("overrides", [(), ("pixel_sampler.unit=tile",), ("train.pixels_place=host",), WEIGHTED])
 def test_training_with_masks_waits_for_nothing_and_learns_no_masked_pixel(masked_capture, overrides):
     config = tiny_config("capture", "train.device=cuda", "density.refine_from=1000", *overrides).without_plan()
     trainer = Trainer(config, masked_capture, DEVICE)
     assert_iterations_wait_for_nothing(trainer)
-    assert_unmasked_alone_is_learnt(trainer)
-
-
-def test_maps_and_photos_on_the_host_have_the_same_masks(masked_capture):
-    config = tiny_config("capture", "train.device=cuda", "train.pixels_place=host")
-    trainer = Trainer(config.without_plan(), masked_capture, DEVICE)
-    loop = TrainingLoop(trainer)
-    loop.run()
-    assert loop.finished
     assert_unmasked_alone_is_learnt(trainer)
 
 

@@ -68,10 +68,8 @@ def test_maps_and_samples_are_those_of_resident_ones(scene, unit):
     step = resident.now
     samples = [trainer.pixel_sampler.sample(trainer.maps, (7, 2, 11), 0.2, step) for trainer in (resident, offloaded)]
     assert torch.equal(samples[0].pixel_ids, samples[1].pixel_ids)
-    truths = [
-        trainer.views.photos.at(drawn).colors() for trainer, drawn in zip((resident, offloaded), samples, strict=True)
-    ]
-    assert torch.equal(*truths)
+    pairs = zip((resident, offloaded), samples, strict=True)
+    assert torch.equal(*(trainer.views.photos.at(drawn).colors() for trainer, drawn in pairs))
     assert (offloaded.maps.offsets == offloaded.views.photos.offsets).all()
 
 
@@ -91,9 +89,7 @@ def test_iterations_that_do_nothing_leave_the_maps_alone(scene, monkeypatch):
     trainer = trained(scene, "host", 10, *EVENTS)
     before = copy.deepcopy(trainer.maps.state_dict())
     trainer.engine.workspace.status[1] = 1  # as after an overflow
-    monkeypatch.setattr(
-        trainer.engine.workspace, "take_lost", lambda wait=False: 0
-    )  # of which the host does not know yet
+    monkeypatch.setattr(trainer.engine.workspace, "take_lost", lambda wait=False: 0)  # the host does not know yet
     trainer.step()
     trainer.step()
     after = trainer.maps.state_dict()

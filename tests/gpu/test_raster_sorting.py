@@ -45,11 +45,7 @@ def render(gaussians, cameras, samples):
 
 
 @pytest.mark.parametrize("count", COUNTS)
-@pytest.mark.parametrize(
-    "depths",
-    [random_depths, equal_depths, close_depths],
-    ids=lambda depths: depths.__name__,
-)
+@pytest.mark.parametrize("depths", [random_depths, equal_depths, close_depths], ids=lambda depths: depths.__name__)
 def test_a_tile_is_in_order(depths, count):
     z = depths(count, torch.Generator().manual_seed(count))
     (got,) = intersections_of_tiles(render(*stacked_splats(z)))

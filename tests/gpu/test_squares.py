@@ -8,20 +8,10 @@ import torch
 from helpers.raster_cases import GPU_ONLY
 from helpers.raster_extremes import CASES
 from helpers.squares import SQUARES, event_at, small_model, spread_squares, window
-from helpers.statistics_cases import (
-    STIFF,
-    SURVIVED,
-    share_of_bound,
-)
+from helpers.statistics_cases import STIFF, SURVIVED, share_of_bound
 from helpers.statistics_errors import CASES as MEASURED
 from helpers.statistics_errors import measure_case, measure_window
-from helpers.stiff_tiles import (
-    TILES,
-    assert_structure_gradients_are_bounded,
-    gradients,
-    structure_gradients,
-    toward_the_photo,
-)
+from helpers.stiff_tiles import TILES, gradients
 from helpers.tolerances import GPU_STATISTICS, GPU_STIFF_STATISTICS, STRUCTURE_BOUND
 
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
@@ -73,14 +63,8 @@ def test_the_same_rows_are_drawn_as_on_a_cpu(count, value):
     assert changes[0].num_pruned == changes[1].num_pruned
 
 
-def test_the_structure_term_is_bounded_on_every_tile():
-    given = structure_gradients("cuda")
-    assert_structure_gradients_are_bounded(given)
-    for name in ("inverted", "inverted edge", "two samples, inverted", "texture, flat prediction"):
-        assert toward_the_photo(given, name) > 0, name
-
-
 def test_the_loss_is_close_to_float64_on_stiff_tiles():
+    """So it is bounded there as the reference's is (tests/stability/test_structure_term.py)."""
     terms = CharbonnierNccLoss(ncc_weight=1.0).terms
     exact = gradients(terms, "cpu", torch.float64)
     for name, got, wanted in zip(TILES, gradients(terms, "cuda"), exact, strict=True):

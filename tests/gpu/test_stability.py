@@ -1,6 +1,5 @@
 """The kernels on the worst inputs of tests/stability."""
 
-import dataclasses
 import itertools
 import math
 
@@ -9,7 +8,7 @@ import torch
 from helpers.framework_runs import tiny_capture, tiny_config
 from helpers.raster_cases import FORWARD_BOUND, GPU_ONLY, GRADIENT_BOUND
 from helpers.raster_extremes import CASES, NAMES, TWO_VIEWS, assert_within, compare, random_scene
-from helpers.tolerances import TOLERANCES
+from helpers.tolerances import TOLERANCES, Tolerance
 
 from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.train.run import train
@@ -23,13 +22,8 @@ pytestmark = GPU_ONLY
 def test_kernels_are_close_to_float64(case):
     """The kernels use the hardware's exponential, so their bound is that of the rasterizer's own tests."""
     single = TOLERANCES[torch.float32]
-    bounds = dataclasses.replace(
-        single,
-        pixel=FORWARD_BOUND,
-        gradient=GRADIENT_BOUND,
-        needle_pixel=5 * FORWARD_BOUND,
-        needle_gradient=max(single.needle_gradient, 5 * GRADIENT_BOUND),
-    )
+    needles = 5 * FORWARD_BOUND, max(single.needle_gradient, 5 * GRADIENT_BOUND)
+    bounds = Tolerance(FORWARD_BOUND, needles[0], GRADIENT_BOUND, needles[1])
     error, errors = compare(case, torch.float32, "cuda")
     assert_within(case, error, errors, bounds)
 

@@ -23,6 +23,7 @@ DEVICE = "cuda"
 SIZES = np.array([(40, 33), (20, 17), (64, 48)], dtype=np.int64)
 STEP = Step(iteration=12, total=100, refine_until=70, seed=3)
 
+DRAWS = [(0.1, "pixel", 0.5), (0.3, "pixel", 0.0), (1.0, "pixel", 1.0), (1.0, "tile", 0.0), (1.0, "emptied", 0.0)]
 CASES = {
     "l1": CharbonnierLoss(),
     "ncc": CharbonnierNccLoss(),
@@ -37,9 +38,14 @@ def make_maps(device, seed=0):
     return ErrorMaps.from_images([image.to(device) for image in images])
 
 
-def make_samples(rate, unit="pixel", importance=0.0, views=(2, 0)):
-    maps = make_maps("cpu")
-    return draw_pixels(DrawRule(unit, 0.4, 0.3, False, importance), maps, views, rate, Step(3, 4, 4))
+def make_samples(rate, unit="pixel", importance=0.0):
+    """`unit`: "emptied" for whole tiles of which the first has no sample and the second one."""
+    rule = DrawRule("pixel" if unit == "pixel" else "tile", 0.4, 0.3, False, importance)
+    samples = draw_pixels(rule, make_maps("cpu"), (2, 0), rate, Step(3, 4, 4))
+    if unit == "emptied":
+        samples.pixel_ids[: samples.tile_offsets[1]] = -1
+        samples.pixel_ids[samples.tile_offsets[1] + 1 : samples.tile_offsets[2]] = -1
+    return samples
 
 
 def make_colors(samples, seed=0):
@@ -57,42 +63,30 @@ def make_colors(samples, seed=0):
     return colors, targets, photos
 
 
+def on_kernels(terms, colors, truth, samples, **extra):
+    """The kernels' loss."""
+    return training_kernels.sparse_loss(
+        terms, colors.to(DEVICE), truth.to(DEVICE), samples_to(samples, DEVICE), **extra
+    )
+
+
 def relative(found, expected):
     return float((found.double().cpu() - expected.double()).norm() / expected.double().norm().clamp(min=1e-30))
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize(
-    ("rate", "unit", "importance"), [(0.1, "pixel", 0.5), (0.3, "pixel", 0.0), (1.0, "pixel", 1.0), (0.5, "tile", 0.0)]
-)
+@pytest.mark.parametrize(("rate", "unit", "importance"), DRAWS)
 def test_equals_the_twin(name, rate, unit, importance):
     terms = CASES[name].terms
     samples = make_samples(rate, unit, importance)
     colors, targets, photos = make_colors(samples)
     expected = sparse_loss(terms, colors.double(), targets.double(), samples)
     for truth, extra in ((targets, {}), (photos, {"update": MapUpdate(make_maps(DEVICE), STEP)})):
-        found = training_kernels.sparse_loss(
-            terms, colors.to(DEVICE), truth.to(DEVICE), samples_to(samples, DEVICE), **extra
-        )
+        found = on_kernels(terms, colors, truth, samples, **extra)
         assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
         assert relative(found.color_gradients, expected.color_gradients) < 1e-5
         assert not found.color_gradients.cpu()[~samples.filled].any()
         torch.testing.assert_close(found.pixel_errors.cpu(), expected.pixel_errors, rtol=1e-5, atol=2e-7)
-
-
-def test_windows_of_tiles_with_one_sample_or_none():
-    samples = make_samples(1.0, "tile")
-    pixel_ids = samples.pixel_ids.clone()
-    pixel_ids[: samples.tile_offsets[1]] = -1  # a tile without a sample
-    pixel_ids[samples.tile_offsets[1] + 1 : samples.tile_offsets[2]] = -1  # and one with one
-    samples = replace(samples, pixel_ids=pixel_ids, has_empty_slots=True)
-    colors, targets, _ = make_colors(samples)
-    terms = CASES["ssim"].terms
-    expected = sparse_loss(terms, colors.double(), targets.double(), samples)
-    found = training_kernels.sparse_loss(terms, colors.to(DEVICE), targets.to(DEVICE), samples_to(samples, DEVICE))
-    assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
-    assert relative(found.color_gradients, expected.color_gradients) < 1e-5
-    assert not found.color_gradients.cpu()[~samples.filled].any()
 
 
 @pytest.mark.parametrize("level", [1.0, 1e4, 1e6, 1e8])
@@ -107,7 +101,7 @@ def test_windows_stay_bounded_where_their_variance_is_lost(level):
     bounds = (8 * 2 / 0.03 + 1 / 0.01) / (3 * tiles * filled.clamp(min=1))[tile_of_slot]  # `SSIM_SLOPE` of the twin's
     for colors in (targets + 0.01 * torch.sin(9.0 * x + 5.0 * y)[:, None], targets.roll(1, dims=0)):
         colors = colors * samples.filled[:, None]
-        found = training_kernels.sparse_loss(terms, colors.to(DEVICE), targets.to(DEVICE), samples_to(samples, DEVICE))
+        found = on_kernels(terms, colors, targets, samples)
         assert 0 <= float(found.loss) <= 2
         assert (found.color_gradients.abs().amax(dim=1).cpu() <= bounds).all()
         assert torch.isfinite(found.color_gradients).all()
@@ -127,13 +121,13 @@ def test_the_depth_term_equals_the_twin(name, rate, unit, importance):
     depths[::13], depths[1::17], depths[2::19], depths[3::23] = 0.0, 1e-30, 1e30, torch.inf
     terms = replace(CASES[name].terms, depth_weight=0.7)
     expected = sparse_loss(terms, colors.double(), targets.double(), samples, DepthPair(depths.double(), known))
-    given = terms, colors.to(DEVICE), targets.to(DEVICE), samples_to(samples, DEVICE)
-    found = training_kernels.sparse_loss(*given, DepthPair(depths.to(DEVICE), known.to(DEVICE)))
+    pair = DepthPair(depths.to(DEVICE), known.to(DEVICE))
+    found = on_kernels(terms, colors, targets, samples, depths=pair)
     assert float(found.loss) == pytest.approx(float(expected.loss), rel=1e-5)
     gradients = found.depth_gradients.cpu()
     assert gradients.isfinite().all() and torch.equal(gradients == 0, expected.depth_gradients.float() == 0)
     assert relative(gradients, expected.depth_gradients) < 1e-5 and gradients.any()
-    without = training_kernels.sparse_loss(*given)
+    without = on_kernels(terms, colors, targets, samples)
     assert without.depth_gradients is None and torch.equal(without.color_gradients, found.color_gradients)
 
 
@@ -143,13 +137,7 @@ def test_maps_follow(rate):
     samples = make_samples(rate)
     colors, targets, _ = make_colors(samples)
     maps, twin = make_maps(DEVICE), make_maps("cpu")
-    found = training_kernels.sparse_loss(
-        CASES["ncc"].terms,
-        colors.to(DEVICE),
-        targets.to(DEVICE),
-        samples_to(samples, DEVICE),
-        update=MapUpdate(maps, STEP),
-    )
+    found = on_kernels(CASES["ncc"].terms, colors, targets, samples, update=MapUpdate(maps, STEP))
     twin.update(samples, found.pixel_errors.cpu(), STEP)
     assert torch.equal(maps.errors.cpu(), twin.errors)
     assert torch.equal(maps.stamps.cpu(), twin.stamps)
@@ -165,13 +153,7 @@ def test_bad_colors_stay_out(bad, name):
     slots = torch.tensor([0, 5, 300])
     colors[slots, 1] = bad
     maps = make_maps(DEVICE)
-    found = training_kernels.sparse_loss(
-        CASES[name].terms,
-        colors.to(DEVICE),
-        targets.to(DEVICE),
-        samples_to(samples, DEVICE),
-        update=MapUpdate(maps, STEP),
-    )
+    found = on_kernels(CASES[name].terms, colors, targets, samples, update=MapUpdate(maps, STEP))
     assert torch.isfinite(found.loss)
     gradients = found.color_gradients.cpu()
     assert torch.isfinite(gradients).all() and not gradients[slots].any()
@@ -204,7 +186,5 @@ def test_lost_losses_are_counted_once(name):
     update = MapUpdate(make_maps(DEVICE), STEP, counter)
     for value, expected in ((0.5, 0), (1e38, 1), (0.5, 1), (1e38, 2)):
         colors[::7] = value
-        found = training_kernels.sparse_loss(
-            CASES[name].terms, colors.to(DEVICE), targets.to(DEVICE), samples_to(samples, DEVICE), update=update
-        )
+        found = on_kernels(CASES[name].terms, colors, targets, samples, update=update)
         assert int(counter) == expected and bool(torch.isfinite(found.loss)) == (value == 0.5)

@@ -21,14 +21,7 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.learning_rates import LearningRates
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
 from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
-from turbogs_plugin.types import (
-    PARAMETER_NAMES,
-    GaussianGradients,
-    Gaussians,
-    GaussianStats,
-    PixelSamples,
-    Step,
-)
+from turbogs_plugin.types import PARAMETER_NAMES, GaussianGradients, Gaussians, GaussianStats, PixelSamples, Step
 
 pytestmark = GPU_ONLY
 
@@ -119,8 +112,6 @@ def doubled(value):
 
 def assert_close_gradients(found, expected, name):
     found, expected = found.double().cpu().flatten(), expected.flatten()
-    norms = float(found.norm() * expected.norm())
-    assert float(found @ expected) >= 0.9999 * norms, name
     assert float((found - expected).norm()) <= 1e-4 * float(expected.norm()), name
 
 
@@ -137,9 +128,6 @@ def test_gradients_are_the_reference_s(degree, used_degree, rows):
         assert value.shape == wanted.shape, name
         if wanted.numel():
             assert_close_gradients(value, wanted, name)
-    for name in PARAMETER_NAMES[:-1]:
-        lengths, wanted = (getattr(g, name).double().cpu().reshape(-1, count).norm(dim=0) for g in (found, expected))
-        assert float((lengths - wanted).norm()) <= 1e-4 * float(wanted.norm()), name
     assert torch.equal(found.touched.cpu(), expected.touched)
     assert 0 < int(expected.touched.sum()) < count
     for field in fields(GaussianStats):
@@ -188,9 +176,7 @@ def check_fused_step(name, **case):
             found, wanted = doubled(getattr(moments, field.name)), doubled(getattr(expected_moments, field.name))
             # The rows of the views may cancel in their sum: entries far below the largest carry its rounding.
             bound = 1e-6 * float(wanted.abs().max()) if wanted.numel() else 0.0
-            torch.testing.assert_close(
-                found, wanted, rtol=1e-5, atol=bound, msg=lambda text, n=field.name: f"{n}: {text}"
-            )
+            torch.testing.assert_close(found, wanted, rtol=1e-5, atol=bound, msg=lambda t, n=field.name: f"{n}: {t}")
     assert int(expected_moments.steps.max()) == 3 and int(expected_moments.steps.min()) < 3
     for parameter, value in before.items():
         if value.numel() == 0:

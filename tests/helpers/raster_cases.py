@@ -76,16 +76,17 @@ def make_case(
     )
 
 
-def upstream(case: Case, seed: int = 0) -> dict[str, Tensor]:
-    """Random gradients and errors at the samples, float64 on the CPU, zero in empty slots."""
-    generator = torch.Generator().manual_seed(seed)
+def upstream(case: Case, depths: bool = False) -> dict[str, Tensor]:
+    """Random gradients and errors at the samples, float64 on the CPU, zero in empty slots; with `depths` of depths."""
+    generator = torch.Generator().manual_seed(0)
     count, filled = len(case.samples), case.samples.filled
     values = {
         "color_gradients": torch.randn(count, 3, generator=generator),
         "pixel_errors": torch.rand(count, generator=generator),
         "alpha_gradients": torch.randn(count, generator=generator),
-        "depth_gradients": torch.randn(count, generator=generator),
     }
+    if depths:
+        values["depth_gradients"] = torch.randn(count, generator=generator)
     return {name: (value * filled.reshape(-1, *[1] * (value.dim() - 1))).double() for name, value in values.items()}
 
 
@@ -131,3 +132,9 @@ def assert_gradients_close(got: Tensor, wanted: Tensor, what: str, bound: float 
     large = wanted_rows > 1e-3 * wanted_rows.max()
     ratio = rows[large] / wanted_rows[large]
     assert (ratio - 1).abs().quantile(0.99) <= 10 * GRADIENT_BOUND, f"{what}: row magnitudes differ"
+
+
+def assert_records_close(records: Tensor, wanted: Tensor) -> None:
+    """Every column of `layout.ScreenRecord`."""
+    for name, column in RECORD_COLUMNS.items():
+        assert_gradients_close(records[..., column], wanted[..., column], name)

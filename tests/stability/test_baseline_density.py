@@ -102,7 +102,7 @@ def test_a_gaussian_that_is_not_finite_goes(name, parameter, bad):
     getattr(gaussians, parameter)[7] = bad
     result = follow(controller(name, gaussians, random_stats(40, 1)), gaussians)
     assert all_finite(result)
-    assert 7.0 not in result.sh0[:, 0, 0] and 8.0 in result.sh0[:, 0, 0]
+    assert 7.0 not in result.sh0[:, 0, 0] and 6.0 in result.sh0[:, 0, 0]
 
 
 @pytest.mark.parametrize("name", MAKERS)

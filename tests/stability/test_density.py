@@ -13,11 +13,7 @@ from turbogs_plugin.types import Step
 
 EVENT = Step(iteration=200, total=5000, refine_until=3500, seed=7, scene_extent=1.0)
 VALUES = st.sampled_from([0.0, 1e-30, 1e-4, 1.0, 1e30, float("inf"), float("nan")])
-ORDERS = (
-    {},
-    {"choose_by": "squares"},
-    {"choose_by": "squares", "prune_score_fraction": 0.2},
-)
+ORDERS = ({}, {"choose_by": "squares"}, {"choose_by": "squares", "prune_score_fraction": 0.2})
 PARAMETERS = st.sampled_from([0.0, 1.0, -20.0, 20.0, -200.0, 50.0, 88.0, 200.0, 1e30, float("inf"), float("nan")])
 
 
@@ -32,8 +28,7 @@ def test_what_is_too_large_to_split_goes(split, log_scale):
     for name in ("error_sums", "weight_sums", "grad_sums", "view_counts"):
         getattr(density.stats, name).fill_(1.0)
     result = density.update(gaussians, EVENT).apply(gaussians)
-    assert all_finite(result)
-    assert len(result) == (400 if log_scale == 40 else 200)
+    assert all_finite(result) and len(result) == (400 if log_scale == 40 else 200)
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)

@@ -71,19 +71,3 @@ def test_a_tile_without_a_sample_is_as_if_it_were_not_listed(loss, tiles):
         torch.testing.assert_close(ours, expected, rtol=1e-9, atol=1e-12)
     for ours, expected in zip(*structures, strict=True):
         torch.testing.assert_close(ours, expected, rtol=1e-9, atol=1e-12)
-
-
-def test_no_sample_at_all():
-    """Every listed tile is empty: no loss, no gradient, and no map changes."""
-    gaussians, cameras = make_gaussians(10), make_cameras(SIZES)
-    whole = dense_samples(cameras)
-    samples = emptied(whole, list(range(len(whole.tile_ids))))
-    maps = ErrorMaps.from_images([torch.full((height, width), 0.5) for width, height in SIZES])
-    before = maps.errors.clone()
-    rendered = rasterize(gaussians, cameras, samples)
-    result = CharbonnierNccLoss()(rendered.colors, torch.zeros_like(rendered.colors), samples)
-    maps.update(samples, result.pixel_errors, NOW)
-    gradients = rendered.backward(result.color_gradients, result.pixel_errors).parameter_gradients(True, None)
-    assert result.loss == 0 and torch.equal(maps.errors, before)
-    assert not gradients.touched.any()
-    assert all((value == 0).all() for value in vars(gradients).values() if isinstance(value, torch.Tensor))

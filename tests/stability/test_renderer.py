@@ -49,12 +49,10 @@ def test_any_gaussian_among_ordinary_ones_stays_finite(sizes, place, norm, logit
     samples = dense_samples(cameras)
     rendered = rasterize(gaussians, cameras, samples, with_depth=True)
     ones, stats = torch.ones_like(rendered.alphas), GaussianStats.zeros(len(gaussians), "cpu")
-    screen = rendered.backward(
-        torch.ones_like(rendered.colors), ones, with_statistics=True, alpha_gradients=ones, depth_gradients=ones
-    )
+    upstream = {"alpha_gradients": ones, "depth_gradients": ones}
+    screen = rendered.backward(torch.ones_like(rendered.colors), ones, with_statistics=True, **upstream)
     gradients = screen.parameter_gradients(rows=True, stats=stats)
     assert all(value.isfinite().all() for value in (rendered.colors, rendered.alphas, rendered.depths))
     assert all(value.isfinite().all() for value in (*vars(gradients).values(), *vars(stats).values()))
     for name in NAMES[:-1]:
-        value = getattr(gradients, name)[:, ~gradients.touched]
-        assert (value == 0).all(), name
+        assert (getattr(gradients, name)[:, ~gradients.touched] == 0).all(), name

@@ -12,7 +12,7 @@ from helpers.squares import EVENT, SQUARES, event, event_at, grown, removed, sma
 
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity, _decayed
 from turbogs_plugin.strategies.density.growth import TINY, drawn_by_squares
-from turbogs_plugin.types import GaussianStats, Step
+from turbogs_plugin.types import Step
 
 COUNT = 40
 
@@ -63,13 +63,6 @@ def test_the_cut_to_a_cap_holds_where_squares_overflow(square, cap):
     stats = window([square, math.nan, math.inf, square / 3, square, square * 1.1])
     kept = event(gaussians, stats, max_gaussians=3, prune_score_fraction=0.0).source.tolist()
     assert kept == [2, 4, 5]  # the least, and the first of two average ones
-
-
-def test_nothing_seen_in_a_window_changes_nothing():
-    gaussians = small_model(COUNT)
-    assert event(gaussians, GaussianStats.zeros(COUNT, "cpu")) is None
-    decayed = event(gaussians, GaussianStats.zeros(COUNT, "cpu"), opacity_decay=0.4)
-    assert decayed.source.tolist() == list(range(COUNT)) and not decayed.fresh.any()
 
 
 @pytest.mark.parametrize("value", [0.0, -0.0, 1e-45, 1e-30, 1e-14, 3e38, math.inf, math.nan])

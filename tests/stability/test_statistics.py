@@ -8,12 +8,7 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers.raster_extremes import CASES, TWO_VIEWS, random_scene
-from helpers.statistics_cases import (
-    STIFF,
-    SURVIVED,
-    pass_statistics,
-    share_of_bound,
-)
+from helpers.statistics_cases import STIFF, SURVIVED, pass_statistics, share_of_bound
 from helpers.statistics_errors import CASES as MEASURED
 from helpers.statistics_errors import measure_case, measure_window
 from helpers.tolerances import STATISTICS, STIFF_STATISTICS
@@ -38,8 +33,7 @@ def test_the_sums_of_a_long_window_are_close_to_float64():
 @pytest.mark.parametrize("case", CASES)
 def test_all_absolute_gradients_share_the_colours_gradient(case):
     """So that a threshold of the absolute gradient bounds how many Gaussians are above it."""
-    share = share_of_bound(case, "cpu")
-    assert share <= 1
+    assert share_of_bound(case, "cpu") <= 1
 
 
 @pytest.mark.parametrize("assert_survived", SURVIVED)

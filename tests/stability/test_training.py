@@ -48,14 +48,8 @@ def saved_model(folder: Path) -> dict[str, torch.Tensor]:
 
 
 SHORT = (
-    "train.iterations=9",
-    "train.refine_until=7",
-    "train.sh_interval=2",
-    "density.refine_from=1",
-    "density.refine_every=2",
-    "density.final_every=1",
-    "density.max_gaussians=600",
-    "train.device=cpu",
+    *("train.iterations=9", "train.refine_until=7", "train.sh_interval=2", "train.device=cpu"),
+    *("density.refine_from=1", "density.refine_every=2", "density.final_every=1", "density.max_gaussians=600"),
 )
 """On top of `TINY`: as many events and degrees in fewer iterations."""
 
@@ -115,13 +109,10 @@ PHOTOS = {
 }
 
 
-EXPOSED = ("black", "exposures", "one black photo")
-"""Photos that are also trained with exposures."""
+EXPOSED = [(name, True) for name in ("black", "exposures", "one black photo")]
 
 
-@pytest.mark.parametrize(
-    ("name", "exposure"), [*((name, False) for name in PHOTOS), *((name, True) for name in EXPOSED)]
-)
+@pytest.mark.parametrize(("name", "exposure"), [*((name, False) for name in PHOTOS), *EXPOSED])
 def test_photos_without_information(variant, tmp_path, name, exposure):
     """Exposures end near the identity, and those of black photos take no other photo's with them. Plots of black photos
     are drawn."""
@@ -147,8 +138,7 @@ def test_identical_cameras(variant, tmp_path, copies):
             reconstruction.frames[reconstruction.images[number].frame_id].rig_from_world = pose
 
     edit_model(variant, change)
-    centers = torch.linalg.inv(load_scene(variant).train.cameras.viewmats)[:, :3, 3]
-    assert len(centers.unique(dim=0)) == (6 if copies == 2 else 1)
+    assert len(load_scene(variant).train.cameras.centers.unique(dim=0)) == (6 if copies == 2 else 1)
     # Cameras that look one way get a backdrop of 3000, which the cap counts from the start.
     train_to_the_end(variant, tmp_path / "run", "density.max_gaussians=4500")
 
@@ -169,9 +159,7 @@ def test_masks_of_one_pixel(variant, tmp_path, unit):
         return mask
 
     write_masks(variant, keep)
-    outcome = train_to_the_end(variant, tmp_path / "run", f"pixel_sampler.unit={unit}")
-    last = outcome.history[-1]
-    assert last.nonfinite_losses == last.skipped_updates == 0 and last.num_gaussians > 0
+    train_to_the_end(variant, tmp_path / "run", f"pixel_sampler.unit={unit}")
 
 
 def test_a_view_masked_whole(variant, tmp_path):
