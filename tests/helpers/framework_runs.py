@@ -17,21 +17,11 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.trainer import Trainer
 
 TINY = (
-    "train.iterations=14",
-    "train.refine_until=9",
-    "train.sh_degree=2",
-    "train.sh_interval=4",
-    "train.evaluate_at=[0.5]",
-    "train.checkpoint_every=5",
-    "schedule.min_views=2",
-    "schedule.max_views=4",
-    "schedule.pixel_budget=0.3",
-    "density.refine_from=2",
-    "density.refine_every=3",
-    "density.final_every=2",
-    "density.grad_threshold=1e-6",
-    "density.top_fraction=0.3",
-    "density.opacity_decay=0.2",
+    *("train.iterations=14", "train.refine_until=9", "train.sh_degree=2", "train.sh_interval=4"),
+    *("train.evaluate_at=[0.5]", "train.checkpoint_every=5"),
+    *("schedule.min_views=2", "schedule.max_views=4", "schedule.pixel_budget=0.3"),
+    *("density.refine_from=2", "density.refine_every=3", "density.final_every=2", "density.grad_threshold=1e-6"),
+    *("density.top_fraction=0.3", "density.opacity_decay=0.2"),
 )
 
 ENDLESS = ("train.iterations=100000", "train.refine_until=9", "train.checkpoint_every=3", "train.evaluate_at=[]")

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import socket
 import sys
 import time
 from collections.abc import Callable
@@ -22,39 +21,24 @@ STORES: list[torch.distributed.TCPStore] = []
 PRELOADED = [
     "torch",
     "torch.fx.experimental.symbolic_shapes",  # and sympy: the first gradient of each process would import them
-    "turbogs_plugin.train.run",
-    "turbogs_plugin.report.run_report",
-    "turbogs_plugin.cli",
-    "turbogs_plugin.strategies.density.error_driven",
-    "pycolmap",
-    "numpy.ma",
-    "numpy.random",
-    "torch.distributed.launcher.api",
+    *(
+        f"turbogs_plugin.{name}"
+        for name in ("train.run", "report.run_report", "cli", "strategies.density.error_driven")
+    ),
+    *("pycolmap", "numpy.ma", "numpy.random", "torch.distributed.launcher.api"),
     "pytest",  # which the module of a test imports
 ]
 
 
-def free_port() -> int:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return listener.getsockname()[1]
-
-
 def start_ranks(count: int, function: Callable[..., object], folder: Path, *arguments: Any) -> list[Any]:
-    """Start `function(*arguments)` in `count` processes with torchrun's variables; stderr goes to ``folder/err-RANK``.
-
-    Returns:
-        The processes.
-    """
+    """Processes in which `function(*arguments)` runs with torchrun's variables; stderr goes to ``folder/err-RANK``."""
     folder.mkdir(parents=True, exist_ok=True)
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
-    port = free_port()
-    # As torchrun's agent does: the store outlives every process.
-    store = torch.distributed.TCPStore("127.0.0.1", port, is_master=True, wait_for_workers=False)
-    processes = [
-        context.Process(target=_rank, args=(rank, count, port, function, folder, arguments)) for rank in range(count)
-    ]
+    # As torchrun's agent does: the store, at a free port, outlives every process.
+    store = torch.distributed.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
+    shared = (count, store.port, function, folder, arguments)
+    processes = [context.Process(target=_rank, args=(rank, *shared)) for rank in range(count)]
     for process in processes:
         process.start()
     STORES[:] = [store]

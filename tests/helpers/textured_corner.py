@@ -9,6 +9,8 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
+from turbogs_plugin.scene.geometry import look_at
+
 SIZE = (320, 240)
 FOCAL = 300.0
 EXTENT = 4.0
@@ -22,14 +24,9 @@ def camera_centers(count: int) -> np.ndarray:
     return np.stack([4.0 * np.cos(angles), 4.0 * np.sin(angles), heights], axis=1)
 
 
-def viewmat(center: np.ndarray, target: tuple[float, float, float] = (0.6, 0.6, 0.7)) -> np.ndarray:
+def viewmat(center: np.ndarray) -> np.ndarray:
     """[3, 4] world to camera: x right, y down, z forward."""
-    forward = np.array(target) - center
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return np.concatenate([rotation, -rotation @ center[:, None]], axis=1)
+    return look_at(center, np.array([0.6, 0.6, 0.7]), np.array([0.0, 0.0, 1.0]))[:3]
 
 
 def render_corner(center: np.ndarray, seed: int = 0) -> Image.Image:

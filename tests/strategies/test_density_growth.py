@@ -13,36 +13,23 @@ from turbogs_plugin.types import Step
 
 COUNT = 40
 FULL = Step(1200, 3500, 3500, seed=3, scene_extent=2.0)  # no final pruning follows
-GROWS = {
-    "grad_threshold": 0.0,
-    "absgrad_threshold": 0.0,
-    "top_fraction": 1.0,
-    "prune_world_size": 0.0,
-    "prune_opacity": 0.0,
-}
+GROWS = {"absgrad_threshold": 0.0, "prune_world_size": 0.0, "prune_opacity": 0.0}
 """All that is seen may grow, and nothing is pruned but by the order."""
 
 
-def first_drawn(squares: list[float], draws: int) -> list[float]:
-    """Share of draws in which each row comes first."""
-    stats = window(squares)
-    steps = (Step(100 * i, 10**9, 10**9, seed=0) for i in range(draws))
-    first = [int(drawn_by_squares(stats, step).argmax()) for step in steps]
-    return [first.count(row) / draws for row in range(len(squares))]
-
-
 def test_a_draw_has_the_chances_of_the_squares():
-    shares = first_drawn([0.0, 1e-9, 1e-9, 8e-9, math.nan], 1000)
+    """Of a thousand draws, how often each row comes first."""
+    stats, steps = window([0.0, 1e-9, 1e-9, 8e-9, math.nan]), [Step(100 * i, 10**9, 10**9) for i in range(1000)]
+    first = torch.stack([drawn_by_squares(stats, step).argmax() for step in steps])
+    shares = (first.bincount(minlength=5) / 1000).tolist()
     assert shares[0] == shares[4] == 0
     assert abs(shares[3] - 0.8) < 0.05 and abs(shares[1] - 0.1) < 0.04 and abs(shares[2] - 0.1) < 0.04
 
 
 def test_a_draw_is_a_function_of_seed_and_iteration():
     stats = random_stats(COUNT, seed=1)
-    one, same, later, other = (
-        drawn_by_squares(stats, step)
-        for step in (FULL, FULL, Step(1300, 3500, 3500, seed=3), Step(1200, 3500, 3500, seed=4))
-    )
+    steps = (FULL, FULL, Step(1300, 3500, 3500, seed=3), Step(1200, 3500, 3500, seed=4))
+    one, same, later, other = (drawn_by_squares(stats, step) for step in steps)
     assert torch.equal(one, same) and not torch.equal(one, later) and not torch.equal(one, other)
 
 

@@ -34,14 +34,8 @@ def make_samples(counts, empty=(), weights=None):
     offsets = np.concatenate([[0], np.cumsum(counts)])
     for tile, number in enumerate(empty):
         ids[offsets[tile + 1] - number : offsets[tile + 1]] = -1
-    return PixelSamples(
-        (0,),
-        np.array([[16 * len(counts), 16]]),
-        torch.as_tensor(ids, dtype=torch.int32),
-        torch.arange(len(counts), dtype=torch.int32),
-        torch.as_tensor(offsets, dtype=torch.int32),
-        weights,
-    )
+    lists = (torch.as_tensor(values, dtype=torch.int32) for values in (ids, range(len(counts)), offsets))
+    return PixelSamples((0,), np.array([[16 * len(counts), 16]]), *lists, weights)
 
 
 def random_case(seed=0, counts=(5, 9, 1, 12, 3), empty=(1, 0, 0, 4, 2), weighted=False, dtype=torch.float64):
@@ -118,9 +112,8 @@ def expected_loss(loss, colors, targets, samples, balance):
     l1 = (w[filled, None] * (np.sqrt(d**2 + EPSILON**2) - EPSILON)).mean()
     if isinstance(loss, CharbonnierLoss):
         return l1
-    weight, base = (
-        (loss.ssim_weight, 1 - loss.ssim_weight) if isinstance(loss, SparseSsimLoss) else (loss.ncc_weight, 1)
-    )
+    ssim = isinstance(loss, SparseSsimLoss)
+    weight, base = (loss.ssim_weight, 1 - loss.ssim_weight) if ssim else (loss.ncc_weight, 1)
     structure, coordinates = 0.0, samples.coordinates().numpy()
     for slots, factor in zip(tiles_of(samples), balance, strict=True):
         for channel in range(3):
@@ -178,10 +171,9 @@ def test_empty_slots_have_no_part(loss):
 
 def test_pixel_errors_are_l1_norms():
     colors, targets, samples = random_case()
-    result = CharbonnierNccLoss()(colors, targets, samples)
+    errors = CharbonnierNccLoss()(colors, targets, samples).pixel_errors
     expected = torch.where(samples.filled, (colors - targets).abs().sum(dim=1), 0.0)
-    assert result.pixel_errors.dtype == torch.float32
-    assert torch.allclose(result.pixel_errors, expected.float(), rtol=1e-6)
+    assert errors.dtype == torch.float32 and torch.allclose(errors, expected.float(), rtol=1e-6)
 
 
 def test_printed_ncc_is_the_appendix():
