@@ -5,7 +5,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
-from helpers.raster_cases import GPU_ONLY, samples_to
+from helpers.raster_cases import GPU_ONLY
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.distributed.peer_memory import aligned_starts
@@ -87,7 +87,6 @@ class Scene:
         images = [number for row, size in enumerate(self.cameras.sizes.tolist()) for number in (*size, row)]
         return CudaScreenGradients(
             scene=launches.Scene(gaussians, viewmats, Ks, images, self.degree, DEFAULT_SETTINGS.eps2d),
-            samples=samples_to(self.samples, DEVICE),
             records=torch.where(on_screen, self.records, torch.nan).to(DEVICE, copy=True),
             radii=self.radii.to(DEVICE),
             overflow=overflow,
