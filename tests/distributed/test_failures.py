@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -92,23 +92,18 @@ def trained(count: int, folder: Path, capture: Path, trouble: str = "", *overrid
     return codes, said(folder)
 
 
-def errors_in(text: str) -> list[str]:
-    """Lines with the word."""
-    return [line for line in text.splitlines() if "error" in line.lower()]
+def the_error(text: str) -> str:
+    """The one line with the word."""
+    (line,) = [line for line in text.splitlines() if "error" in line.lower()]
+    return line
 
 
-@pytest.fixture(scope="module")
-def of_two(capture, tmp_path_factory) -> Path:
-    """A whole run of two processes, which keeps a copy of its checkpoint of iteration 5."""
-    folder = tmp_path_factory.mktemp("of-two")
-    codes, text = trained(2, folder, capture, "", "train.checkpoint_every=10")
-    assert codes == [0, 0], text
-    return folder / "run"
-
-
-def test_a_run_goes_on_with_another_number_of_processes(of_two, capture, tmp_path):
+def test_a_run_goes_on_with_another_number_of_processes(capture, tmp_path):
     """From iteration 10 of a run of two, which leaves what one process leaves. One and four processes take it to the
     end, and two to equal bits."""
+    codes, text = trained(2, tmp_path, capture, "", "train.checkpoint_every=10")
+    assert codes == [0, 0], text
+    of_two = tmp_path / "run"
     assert [evaluation.iteration for evaluation in read_history(of_two / "history.jsonl")] == [0, 7, 14]
     assert (of_two / "model.ply").is_file() and (of_two / "wall.json").is_file()
     finals = {}
@@ -137,7 +132,7 @@ def test_a_process_killed_at_a_random_moment_ends_all_with_one_line(seed, captur
     processes = start_ranks(2, training, tmp_path, tiny_config(capture), tmp_path / "run", f"killed at {seed}")
     codes = ended(processes, SECONDS)
     assert codes[lost] == -signal.SIGKILL and codes[1 - lost] == 1, said(tmp_path)
-    (line,) = errors_in(said(tmp_path))
+    line = the_error(said(tmp_path))
     assert "another process of this training ended" in line
     newest = latest_checkpoint(folder)
     if newest is not None:
@@ -155,7 +150,7 @@ TROUBLES = {
 def test_trouble_of_one_process_ends_all_with_its_own_line(trouble, capture, tmp_path):
     codes, text = trained(2, tmp_path, capture, trouble, "train.checkpoint_every=3")
     assert set(codes) <= {1, 2}, (codes, text)
-    (line,) = errors_in(text)
+    line = the_error(text)
     assert TROUBLES[trouble] in line and "turbogs: error:" in line
     newest = latest_checkpoint(tmp_path / "run/checkpoints")
     assert f"the last good checkpoint is '{newest}'" in line and newest.name == "iteration-000003.pt"
@@ -242,39 +237,33 @@ def running(processes: list[int]) -> list[int]:
     return [process for process in processes if state(process)[0] not in "XZ"]
 
 
-def left_after_its_kill(words: list[str], folder: Path, working: Callable[[], bool]) -> list[int]:
-    """Start a command, and kill it alone as soon as its processes are `working`: which of them stay.
+@pytest.mark.skipif(sys.platform != "linux", reason="by a call of Linux")
+def test_processes_of_a_training_end_with_their_launcher(capture, tmp_path):
+    """A launcher that is killed outright, as by the kernel when memory is short: nothing that it started goes on.
 
-    One of them hangs then, as in a call of a GPU, and hears nothing but SIGKILL; in a training the other waits for it.
+    One process hangs then, as in a call of a GPU, and hears nothing but SIGKILL; the other waits for it.
     """
-    with (folder / "told").open("w") as told:
+    checkpoints = tmp_path / "run/checkpoints"
+    words = ["train", str(capture), "--out", str(tmp_path / "run"), "--gpus", "2", "--device", "cpu", "--no-report"]
+    words += [*TINY, *ENDLESS]
+    with (tmp_path / "told").open("w") as told:
         command = [sys.executable, "-m", "turbogs_plugin", *words]
         launcher = subprocess.Popen(command, stdout=told, stderr=told, start_new_session=True)
     processes: list[int] = []
     try:
-        assert comes_true(lambda: working() or launcher.poll() is not None, 2 * SECONDS), "it does not begin"
+        assert comes_true(lambda: latest_checkpoint(checkpoints) or launcher.poll() is not None, 2 * SECONDS)
         everybody = sorted(int(path.name) for path in Path("/proc").glob("[0-9]*"))
         processes = [process for process in everybody if state(process)[1] == launcher.pid]
-        assert launcher.poll() is None and len(processes) >= 2, (folder / "told").read_text()
+        assert launcher.poll() is None and len(processes) >= 2, (tmp_path / "told").read_text()
         os.kill(processes[-1], signal.SIGSTOP)
         launcher.kill()
         launcher.wait()
-        comes_true(lambda: not running(processes), 2 * SECONDS)
-        return running(processes)
+        assert comes_true(lambda: not running(processes), 2 * SECONDS)
     finally:
         launcher.kill()
         launcher.wait()
         for process in running(processes):
             os.kill(process, signal.SIGKILL)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="by a call of Linux")
-def test_processes_of_a_training_end_with_their_launcher(capture, tmp_path):
-    """A launcher that is killed outright, as by the kernel when memory is short: nothing that it started goes on."""
-    checkpoints = tmp_path / "run/checkpoints"
-    words = ["train", str(capture), "--out", str(tmp_path / "run"), "--gpus", "2", "--device", "cpu", "--no-report"]
-    words += [*TINY, *ENDLESS]
-    assert not left_after_its_kill(words, tmp_path, lambda: latest_checkpoint(checkpoints) is not None)
     newest = latest_checkpoint(checkpoints)
     iteration = load_checkpoint(newest)["trainer"]["iteration"]
     assert iteration >= 3 and newest.name == f"iteration-{iteration:06d}.pt"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.framework_runs import tiny_capture, tiny_settings
+from helpers.framework_runs import assert_identical, tiny_capture, tiny_settings
 from helpers.models import random_gaussians
 from helpers.peer_files import KeepingEngine, PeerFiles
 from helpers.processes import ended, grouped, said, start_ranks
@@ -70,13 +70,6 @@ def run(trainer: Trainer, way: bool | None = True) -> dict:
     return copy.deepcopy(dict(leaves(trainer.state_dict(), "state")))
 
 
-def same(first: dict, second: dict) -> None:
-    assert first.keys() == second.keys()
-    for name, value in first.items():
-        equal = torch.equal(value, second[name]) if isinstance(value, torch.Tensor) else value == second[name]
-        assert equal, name
-
-
 def every_case(capture: Path, folder: Path) -> None:
     """In every process: each case by messages and in place; the memory grows by an event of density control."""
     ranks, wanted = grouped(), {}
@@ -87,7 +80,7 @@ def every_case(capture: Path, folder: Path) -> None:
         memory = PeerFiles(folder / name)
         trainer = trainer_of(capture, ranks, memory, *CASES[name])
         number = len(trainer.gaussians)
-        same(run(trainer), wanted[name])
+        assert_identical(run(trainer), wanted[name])
         assert len(trainer.gaussians) != number
         assert memory.barriers == [WRITTEN, DRAWN, STEPPED] * STEPS
     few(capture, ranks, folder)
@@ -103,11 +96,11 @@ def without_some_memory(capture: Path, ranks: ProcessRanks, folder: Path, wanted
     Nobody asks again. An engine that keeps no passes sends messages, too."""
     for most in (1, 3):  # the first one is the model's, the others are of passes
         files = PeerFiles(folder / f"only {most}", most=most)
-        same(run(trainer_of(capture, ranks, files), None), wanted)
+        assert_identical(run(trainer_of(capture, ranks, files), None), wanted)
         in_place_steps = files.barriers.count(STEPPED)
         assert files.refused == 1 and (0 < in_place_steps < STEPS if most > 1 else in_place_steps == 0)
     files = PeerFiles(folder / "none kept")
-    same(run(trainer_of(capture, ranks, files, engine=ReferenceEngine()), False), wanted)
+    assert_identical(run(trainer_of(capture, ranks, files, engine=ReferenceEngine()), False), wanted)
     assert not files.barriers
 
 
@@ -118,7 +111,7 @@ def growing(capture: Path, ranks: ProcessRanks, folder: Path, wanted: dict) -> N
     files = PeerFiles(folder / "growing")
     trainer = trainer_of(capture, ranks, files)
     counts = [len(trainer.gaussians)]
-    same(run(trainer), wanted)
+    assert_identical(run(trainer), wanted)
     counts.append(len(trainer.gaussians))
     widths = [value[0].numel() for _, value in trainer.gaussians.items()]
     sizes = [aligned_starts([count * width for width in widths])[-1] for count in counts]
@@ -138,7 +131,7 @@ def few(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
         states.append(run(trainer, way))
         assert not torch.equal(trainer.gaussians.means, first.means[:count])
         assert files.barriers.count(STEPPED) == way * STEPS
-    same(*states)
+    assert_identical(*states)
 
 
 def lost(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
@@ -152,7 +145,7 @@ def lost(capture: Path, ranks: ProcessRanks, folder: Path) -> None:
         trainer.complete()
         assert engine.recovered == 1 and int(trainer.optimizer.moments.steps.max()) == 6
         states.append(copy.deepcopy(dict(leaves(trainer.state_dict(), "state"))))
-    same(*states)
+    assert_identical(*states)
 
 
 @pytest.mark.parametrize("count", [2, 3])
