@@ -88,13 +88,7 @@ def test_shares_of_the_loss_change_the_step():
 
 def test_observe_alone_gives_shares_under_any_strategy(capsys):
     host = Host(DefaultStrategy(**LATE), SharedOptimizer(MomentLMOptimizer()), tells_errors=True)
-    step_pre_backward = host.strategy.step_pre_backward
-
-    def with_observe(**arguments):
-        step_pre_backward(**arguments)
-        host.optimizers["means"].observe(arguments["info"])
-
-    host.strategy.step_pre_backward = with_observe
+    host.strategy.step_pre_backward = lambda info, **_: host.optimizers["means"].observe(info)
     host.train(2)
     assert "Adam" not in capsys.readouterr().out
 

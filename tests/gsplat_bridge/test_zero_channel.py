@@ -1,13 +1,15 @@
 """The zero channel's arithmetic, over a compositor in plain torch that stands for gsplat's, which needs a GPU; and
 options of gsplat's trainer that change a render or its errors."""
 
+from unittest.mock import Mock
+
 import gsplat
 import pytest
 import torch
-from helpers.bridge_host import WIDTH, Host, make_splats
+from helpers.bridge_host import WIDTH, Host
 from helpers.gsplat_stand_ins import CAMERAS, COUNT, rendered_info, stand_in, stock_info
+from helpers.refusals import assert_refused
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, loss_shares
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
@@ -32,25 +34,15 @@ def test_it_gives_the_sums_that_our_rasterizer_gives(rendered, packed, monkeypat
 
 def test_optimizer_and_strategy_share_one_further_pass(rendered, monkeypatch):
     info, camera_of = stock_info(rendered, packed=False)
-    calls = []
-
-    def counted(*args, **kwargs):
-        calls.append(1)
-        return stand_in(camera_of)(*args, **kwargs)
-
-    monkeypatch.setattr(gsplat, "rasterize_to_pixels", counted)
-    splats = make_splats(COUNT)
-    shared = SharedOptimizer(MomentLMOptimizer())
-    optimizers = {name: shared([{"params": splats[name], "lr": 1e-3, "name": name}]) for name in splats}
-    strategy = TurboDensityStrategy()
-    state = strategy.initialize_state()
-    optimizers["sh0"].observe(info)
-    for name, value in splats.items():
+    passes = Mock(wraps=stand_in(camera_of))
+    monkeypatch.setattr(gsplat, "rasterize_to_pixels", passes)
+    host = Host(TurboDensityStrategy(), SharedOptimizer(MomentLMOptimizer()))
+    host.optimizers["sh0"].observe(info)
+    for name, value in host.splats.items():
         value.grad = torch.ones_like(value)
-        optimizers[name].step()
-    strategy.step_post_backward(splats, optimizers, state, 0, info)
-    assert len(calls) == 1
-    assert state["driven_by"] == "error"
+        host.optimizers[name].step()
+    host.strategy.step_post_backward(host.splats, host.optimizers, host.state, 0, info)
+    assert passes.call_count == 1 and host.state["driven_by"] == "error"
 
 
 def stock(monkeypatch) -> dict:
@@ -79,8 +71,8 @@ def test_a_prediction_that_the_host_changed_still_drives_density(monkeypatch):
     """By a bilateral grid, or a random background; a depth beside the colours is refused."""
     info = stock(monkeypatch)
     seen = info["prediction"]
-    with pytest.raises(InputError, match=r"expected both \[C, H, W, 3\]"):
-        densified({**info, "prediction": torch.cat([seen, seen[..., :1]], dim=-1)})
+    deeper = {**info, "prediction": torch.cat([seen, seen[..., :1]], dim=-1)}
+    assert_refused(r"expected both \[C, H, W, 3\]", densified, deeper)
     densified({**info, "prediction": seen @ torch.diag(torch.tensor([1.1, 0.9, 1.0]))})
 
 
@@ -101,12 +93,10 @@ def test_errors_of_masked_pixels_count_unless_the_photo_is_black_there_too(monke
 
 def test_info_that_does_not_fit_is_refused(rendered, monkeypatch):
     """A render with the unscented transform leaves no gradient on the screen; its weights are not splats'."""
-    host, info = Host(TurboDensityStrategy()), stock(monkeypatch)
-    with pytest.raises(InputError, match="takes no gradient, as from a render with with_ut"):
-        host.strategy.step_pre_backward(host.splats, host.optimizers, host.state, 0, {"means2d": torch.zeros(1, 40, 2)})
-    small = torch.zeros(CAMERAS, 5, 5, 3)
-    with pytest.raises(InputError, match=r"of shape \(\d, 5, 5, 3\): expected \(\d, 24, 40, 3\), what gsplat"):
-        iteration_stats({**info, "prediction": small, "ground_truth": small}, COUNT)
+    pre, flat = TurboDensityStrategy().step_pre_backward, {"means2d": torch.zeros(1, 40, 2)}
+    assert_refused("takes no gradient, as from a render with with_ut", pre, {}, {}, {}, 0, flat)
+    small = dict.fromkeys(("prediction", "ground_truth"), torch.zeros(CAMERAS, 5, 5, 3))
+    words = r"of shape \(\d, 5, 5, 3\): expected \(\d, 24, 40, 3\), what gsplat"
+    assert_refused(words, iteration_stats, stock(monkeypatch) | small, COUNT)
     late = {key: value for key, value in rendered.items() if key not in ("gaussian_stats", "loss_shares")}
-    with pytest.raises(InputError, match="put them in before backward"):
-        iteration_stats(late, COUNT)
+    assert_refused("put them in before backward", iteration_stats, late, COUNT)
