@@ -65,16 +65,6 @@ def test_swaps(name, example, capture, capsys):
         assert last > first, line
 
 
-def test_sparse_pixels_draws_by_errors_from_the_first_step_on(example, capture):
-    """Zeros would send the share that goes by error back to the pixels visited already."""
-    scene = load_scene(capture)
-    maps = example("sparse_pixels").SparseForward(scene, rate=0.25, iterations=8).maps
-    for view in range(len(scene.train)):
-        start, end = maps.offsets[view : view + 2]
-        expected = scene.train.photos.image(view).sum(dim=-1).reshape(-1).half()
-        torch.testing.assert_close(maps.errors[start:end].cpu(), expected)
-
-
 def test_the_loop_without_a_trainer_is_the_page_s_and_learns(example, capture):
     loop, page = example("plain_loop"), (EXAMPLES.parent / "docs" / "drop-in.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"^```python\n(samples = sampler.*?density.apply.*?)^```$", page, re.DOTALL | re.MULTILINE)
@@ -124,9 +114,8 @@ def third_party(tmp_path, monkeypatch):
     project = tomllib.loads((PACKAGE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     metadata = tmp_path / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
     metadata.mkdir()
-    (metadata / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
-    )
+    named = f"Name: {project['name']}\nVersion: {project['version']}\n"
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\n{named}")
     lines = []
     for group, points in project["entry-points"].items():
         lines += [f"[{group}]", *(f"{name} = {value}" for name, value in points.items())]
@@ -166,9 +155,7 @@ def test_colmap_undistorts_to_the_capture_that_loading_makes(example, tmp_path):
     folder = tmp_path / "raw"
     (folder / "images").mkdir(parents=True)
     y, x = np.mgrid[:120, :160]
-    photo = np.stack([127 + 100 * np.sin(0.1 * x), 127 + 100 * np.cos(0.13 * y), 0.5 * (x + y)], axis=2).astype(
-        np.uint8
-    )
+    photo = np.stack([127 + 100 * np.sin(0.1 * x), 127 + 100 * np.cos(0.13 * y), 0.5 * (x + y)], axis=2).astype("uint8")
     frames = []
     for view in range(4):
         Image.fromarray(photo).save(folder / f"images/{view}.png")

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.refusals import assert_refused
 
 from turbogs_plugin.captures import write_demo_capture
-from turbogs_plugin.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "examples" / "simple_trainer"
@@ -67,26 +67,18 @@ EDITS = """
 """
 
 
-@pytest.mark.parametrize(
-    ("source", "expected"),
-    [("keep\nold one\n", "keep\nnew\none\n"), ("a\nkeep\nb\nold two\n", "a\nkeep\nnew\nb\ntwo\n")],
-)
-def test_edits_find_their_places(script, source, expected):
-    assert script("editing").edited(source, EDITS) == expected
-
-
-@pytest.mark.parametrize(
-    ("source", "words"),
-    [
-        ("keeper\nold one\n", "'keep' and the lines beside it is not there"),
-        ("keep\nkeep\nold one\n", "is there 2 times"),
-        ("keep\nold one\nold two\n", "'old one' and the lines beside it is there 2 times"),
-        ("keep\nnew\nold one\n", "already edited: it has 'new'"),
-    ],
-)
-def test_edits_without_their_place_are_refused(script, source, words):
-    with pytest.raises(InputError, match=re.escape(words)):
-        script("editing").edited(source, EDITS)
+def test_edits_find_their_places_or_are_refused(script):
+    editing = script("editing")
+    assert editing.edited("keep\nold one\n", EDITS) == "keep\nnew\none\n"
+    assert editing.edited("a\nkeep\nb\nold two\n", EDITS) == "a\nkeep\nnew\nb\ntwo\n"
+    refused = {
+        "'keep' and the lines beside it is not there": "keeper\nold one\n",
+        "is there 2 times": "keep\nkeep\nold one\n",
+        "'old one' and the lines beside it is there 2 times": "keep\nold one\nold two\n",
+        "already edited: it has 'new'": "keep\nnew\nold one\n",
+    }
+    for words, source in refused.items():
+        assert_refused(words, editing.edited, source, EDITS)
 
 
 def test_the_command_writes_all_or_nothing(script, tmp_path, monkeypatch, capsys):

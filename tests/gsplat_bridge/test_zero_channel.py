@@ -6,8 +6,8 @@ import pytest
 import torch
 from helpers.bridge_host import WIDTH, Host
 from helpers.gsplat_stand_ins import CAMERAS, COUNT, rendered_info, stand_in, stock_info
+from helpers.refusals import assert_refused
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.gsplat_bridge import TurboDensityStrategy
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 
@@ -54,8 +54,8 @@ def test_a_prediction_that_the_host_changed_still_drives_density(monkeypatch):
     """By a bilateral grid, or a random background; a depth beside the colours is refused."""
     info = stock(monkeypatch)
     seen = info["prediction"]
-    with pytest.raises(InputError, match=r"expected both \[C, H, W, 3\]"):
-        densified({**info, "prediction": torch.cat([seen, seen[..., :1]], dim=-1)})
+    deeper = {**info, "prediction": torch.cat([seen, seen[..., :1]], dim=-1)}
+    assert_refused(r"expected both \[C, H, W, 3\]", densified, deeper)
     densified({**info, "prediction": seen @ torch.diag(torch.tensor([1.1, 0.9, 1.0]))})
 
 
@@ -76,12 +76,10 @@ def test_errors_of_masked_pixels_count_unless_the_photo_is_black_there_too(monke
 
 def test_info_that_does_not_fit_is_refused(rendered, monkeypatch):
     """A render with the unscented transform leaves no gradient on the screen; its weights are not splats'."""
-    host, info = Host(TurboDensityStrategy()), stock(monkeypatch)
-    with pytest.raises(InputError, match="takes no gradient, as from a render with with_ut"):
-        host.strategy.step_pre_backward(host.splats, host.optimizers, host.state, 0, {"means2d": torch.zeros(1, 40, 2)})
-    small = torch.zeros(CAMERAS, 5, 5, 3)
-    with pytest.raises(InputError, match=r"of shape \(\d, 5, 5, 3\): expected \(\d, 24, 40, 3\), what gsplat"):
-        iteration_stats({**info, "prediction": small, "ground_truth": small}, COUNT)
+    pre, flat = TurboDensityStrategy().step_pre_backward, {"means2d": torch.zeros(1, 40, 2)}
+    assert_refused("takes no gradient, as from a render with with_ut", pre, {}, {}, {}, 0, flat)
+    small = dict.fromkeys(("prediction", "ground_truth"), torch.zeros(CAMERAS, 5, 5, 3))
+    words = r"of shape \(\d, 5, 5, 3\): expected \(\d, 24, 40, 3\), what gsplat"
+    assert_refused(words, iteration_stats, stock(monkeypatch) | small, COUNT)
     late = {key: value for key, value in rendered.items() if key != "gaussian_stats"}
-    with pytest.raises(InputError, match="put them in before backward"):
-        iteration_stats(late, COUNT)
+    assert_refused("put them in before backward", iteration_stats, late, COUNT)

@@ -55,8 +55,9 @@ def rasterize_differentiable(
     projected = rendered.projected()
     means2d = projected.means2d.detach().requires_grad_(torch.is_grad_enabled())
     parameters = (value for _, value in gaussians.items())
-    shown = _Pass.apply(rendered, samples, weakref.ref(Info() if info is None else info), means2d, *parameters)
-    return DifferentiableRender(*shown, means2d, projected)
+    known = weakref.ref(Info() if info is None else info)
+    colors, alphas, depths = _Pass.apply(rendered, samples, known, means2d, *parameters)
+    return DifferentiableRender(colors, alphas, depths, means2d, projected)
 
 
 class _Pass(torch.autograd.Function):

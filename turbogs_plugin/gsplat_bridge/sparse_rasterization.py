@@ -153,8 +153,8 @@ def _check_tensors(given: dict[str, Tensor], sh_degree: int | None) -> None:
         if value.dtype not in (torch.float32, torch.float64):  # gradients of fewer bits come back not finite
             raise InputError(f"{name} is of {value.dtype}: expected torch.float32 or torch.float64")
         if (value.dtype, value.device) != (means.dtype, means.device):
-            expected = f"{means.dtype} on {means.device} as means"
-            raise InputError(f"{name} is of {value.dtype} on {value.device}: expected {expected}")
+            wanted = f"{means.dtype} on {means.device} as means"
+            raise InputError(f"{name} is of {value.dtype} on {value.device}: expected {wanted}")
         if name in ("viewmats", "Ks") and value.requires_grad and torch.is_grad_enabled():
             remedy = f"pass {name}.detach(), or optimise the cameras with gsplat's rasterization"
             raise InputError(f"{name} requires a gradient, and cameras get none from sparse_rasterization: {remedy}")
