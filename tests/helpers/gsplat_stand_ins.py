@@ -52,8 +52,7 @@ def stock_info(info, packed: bool):
         stock = {"flatten_ids": (cameras * COUNT + gaussians)[by_depth]}
         camera_of = torch.arange(CAMERAS).repeat_interleave(COUNT)
     stock = {**info, **stock, "isect_offsets": torch.zeros(CAMERAS, 2, 3)}
-    for ours in ("gaussian_stats", "loss_shares"):
-        del stock[ours]
+    del stock["gaussian_stats"]
     return stock, camera_of
 
 

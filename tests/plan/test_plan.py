@@ -16,6 +16,8 @@ from turbogs_plugin.plan import SceneFacts
 from turbogs_plugin.plan.decisions import RULES, plan_from_facts
 from turbogs_plugin.plan.photo_gains import PhotoGains
 from turbogs_plugin.report.run_report import write_report
+from turbogs_plugin.study import cell as cell_module
+from turbogs_plugin.study.results import StudyFolder
 from turbogs_plugin.train import run
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.yaml_json import parse_yaml
