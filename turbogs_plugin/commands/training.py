@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import re
 import shlex
 import sys
 from contextlib import ExitStack
@@ -113,7 +112,7 @@ def plan(
         overrides: changes as in train; train.exposure=auto leaves a setting to the plan, any other value forces it.
         gpus: number of GPUs that would train the model.
     """
-    if scene is not None and re.fullmatch(r"\w+(\.\w+)+=.*", str(scene), re.DOTALL) and not scene.exists():
+    if scene is not None and "=" in str(scene) and not scene.exists():
         scene, overrides = None, (str(scene), *overrides)  # a change of the configuration, and no capture
     settings = options.settings(scene, overrides)
     if scene is None:

@@ -41,12 +41,7 @@ _OTHERS = {
     "pth": "give the point_cloud/iteration_N/point_cloud.ply of its training",
 }
 """Suffixes of models that are not read -> how to make a `.ply` of one."""
-_FOLDERS = [
-    "checkpoints/iteration-*.pt",
-    "point_cloud/iteration_*/point_cloud.ply",
-    "ckpts/ckpt_*_rank0.pt",
-    "ply/*.ply",
-]
+_SAVED = ("checkpoints/iteration-*.pt", "point_cloud/iteration_*/point_cloud.ply", "ckpts/ckpt_*_rank0.pt", "ply/*.ply")
 """Models in folders of trainings: of TurboGS, Inria's 3DGS and gsplat."""
 
 
@@ -124,11 +119,11 @@ def load_with_capture(
 
 
 def require_model(path: str | Path) -> Path:
-    """The file of a model: itself, or the newest one in the folder of a training (`_FOLDERS`). Raises `InputError`
+    """The file of a model: itself, or the newest one in the folder of a training (`_SAVED`). Raises `InputError`
     where there is none, or it is of no kind that is read."""
     path = Path(path)
     if path.is_dir():
-        found = next(filter(None, (list(path.glob(pattern)) for pattern in _FOLDERS)), [])
+        found = next(filter(None, (list(path.glob(pattern)) for pattern in _SAVED)), [])
         if not found:
             raise InputError(f"'{path}' is a folder without a checkpoint of a run: give {KINDS}")
         return max(found, key=lambda file: [int(number) for number in re.findall(r"\d+", str(file.relative_to(path)))])
