@@ -29,6 +29,11 @@ def members_of(splats, optimizer, eps=1e-15, betas=(0.9, 0.999)):
     }
 
 
+def step_all(members):
+    for member in members.values():
+        member.step()
+
+
 def set_gradients(splats, seed):
     generator = torch.Generator().manual_seed(seed)
     for name in PARAMETER_NAMES:
@@ -92,8 +97,7 @@ def test_schedulers_set_the_rate_of_the_next_step():
         for _ in range(2):
             set_gradients(splats, 0)
             before = splats["means"].detach().clone()
-            for member in members.values():
-                member.step()
+            step_all(members)
             scheduler.step()
         moves.append((splats["means"].detach() - before).norm())
     assert moves[1] / moves[0] == pytest.approx(0.5, rel=1e-3)
@@ -102,14 +106,12 @@ def test_schedulers_set_the_rate_of_the_next_step():
 def test_a_missing_gradient_is_zero_and_none_at_all_is_no_step():
     splats = make_splats()
     members = members_of(splats, SparseAdam())
-    for member in members.values():
-        member.step()
+    step_all(members)
     assert not members["means"].state[splats["means"]]
     set_gradients(splats, 0)
     splats["shN"].grad = None
     before = splats["shN"].detach().clone()
-    for member in members.values():
-        member.step()
+    step_all(members)
     assert torch.equal(splats["shN"], before)
 
 
@@ -134,8 +136,7 @@ def test_an_iteration_that_a_grad_scaler_skips_in_part_is_skipped_whole(skipped,
             for host in (ours, alone):
                 surgery("remove", host, torch.Generator().manual_seed(1))
     set_gradients(alone.splats, times)
-    for optimizer in alone.optimizers.values():
-        optimizer.step()
+    step_all(alone.optimizers)
     assert all(torch.equal(ours.splats[name], alone.splats[name]) for name in PARAMETER_NAMES)
     said = capsys.readouterr().out
     assert said.count("an iteration was skipped") == 1 and f"the optimizer of {', '.join(skipped)} was not" in said
@@ -192,22 +193,15 @@ def test_copies_of_members_go_on_by_themselves(rule, copied):
     splats = make_splats()
     members = members_of(splats, RULES[rule]())
     set_gradients(splats, 0)
-    for member in members.values():
-        member.step()
+    step_all(members)
     copies = copied(members)
     values = {name: copies[name].parameter for name in PARAMETER_NAMES}
     before = {name: value.detach().clone() for name, value in values.items()}
     for model, optimizers in ((splats, members), (values, copies)):
         set_gradients(model, 1)
-        for optimizer in optimizers.values():
-            optimizer.step()
+        step_all(optimizers)
         assert torch.equal(values["means"], before["means"]) == (model is splats)
     assert all(torch.equal(splats[name], values[name]) for name in PARAMETER_NAMES)
-
-
-def step_all(members):
-    for member in members.values():
-        member.step()
 
 
 def test_mistakes_are_named_before_anything_moves():

@@ -176,8 +176,6 @@ def test_sparse_loss_hands_its_own_gradient_to_autograd(scene, loss):
 
 
 class OwnLoss(torch.nn.Module):
-    terms = None
-
     def forward(self, colors, targets, samples):
         return CharbonnierLoss()(colors, targets, samples)
 

@@ -6,7 +6,6 @@ strategy made in `populate_modules`, and hooks called by the model.
 
 import copy
 import re
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,51 +22,38 @@ DROP_IN = Path(__file__).resolve().parents[2] / "docs" / "drop-in.md"
 OURS = {"features_dc": "sh0", "features_rest": "shN"}
 
 
-@dataclass
 class SplatfactoModel:
     """What the recipe touches, and the order of calls; images are rendered by our reference."""
 
-    training: bool = True
-    config: Any = field(
-        default_factory=lambda: SimpleNamespace(
-            warmup_length=2, stop_split_at=20, refine_every=3, reset_alpha_every=4, num_train_data=3
-        )
-    )
+    training = True
+    config = SimpleNamespace(warmup_length=2, stop_split_at=20, refine_every=3, reset_alpha_every=4)
+    cameras, samples = make_cameras(1), dense_samples(make_cameras(1))
 
     def populate_modules(self) -> None:
         splats = make_splats()
-        self.gauss_params = torch.nn.ParameterDict(
-            {
-                **{name: splats[name] for name in ("means", "scales", "quats")},
-                "features_dc": torch.nn.Parameter(splats["sh0"].detach()[:, 0].clone()),
-                "features_rest": splats["shN"],
-                "opacities": torch.nn.Parameter(splats["opacities"].detach()[:, None].clone()),
-            }
-        )
-        pause = self.config.num_train_data + self.config.refine_every
-        self.strategy = DefaultStrategy(pause_refine_after_reset=pause)
+        values = {name: splats[name].detach() for name in ("means", "scales", "quats")}
+        values |= {"features_dc": splats["sh0"].detach()[:, 0], "features_rest": splats["shN"].detach()}
+        values |= {"opacities": splats["opacities"].detach()[:, None]}
+        self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(v) for name, v in values.items()})
+        self.strategy = DefaultStrategy(pause_refine_after_reset=6)
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
-        self.cameras = make_cameras(1)
-        self.samples = dense_samples(self.cameras)
 
     def gsplat_names(self) -> dict[str, torch.Tensor]:
         values = {OURS.get(name, name): value for name, value in self.gauss_params.items()}
         return {**values, "sh0": values["sh0"][:, None], "opacities": values["opacities"].squeeze(-1)}
 
     def get_outputs(self, step: int) -> dict[str, torch.Tensor]:
-        colors, _, self.info = sparse_rasterization(
-            **arguments(self.gsplat_names(), self.cameras), samples=self.samples, sh_degree=1, absgrad=True
-        )
+        given = arguments(self.gsplat_names(), self.cameras)
+        colors, _, self.info = sparse_rasterization(**given, samples=self.samples, sh_degree=1, absgrad=True)
         self.strategy.step_pre_backward(self.gauss_params, self.optimizers, self.strategy_state, step, self.info)
         places = self.samples.pixel_ids.long()
         image = torch.zeros_like(colors).index_copy(0, places, colors).reshape(HEIGHT, WIDTH, 3)
         return {"rgb": image, "background": torch.zeros(3)}
 
-    def get_gt_img(self, image: torch.Tensor) -> torch.Tensor:
+    def get_gt_img(self, image: torch.Tensor, background: torch.Tensor | None = None) -> torch.Tensor:
         return image
 
-    def composite_with_background(self, image: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
-        return image
+    composite_with_background = get_gt_img
 
     def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: Any = None) -> dict[str, torch.Tensor]:
         return {"main_loss": (outputs["rgb"] - batch["image"]).abs().mean()}
@@ -82,9 +68,8 @@ class SplatfactoModel:
             for optimizer in self.optimizers.values():
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)
-            self.strategy.step_post_backward(
-                self.gauss_params, self.optimizers, self.strategy_state, step, self.info, packed=False
-            )
+            common = (self.gauss_params, self.optimizers, self.strategy_state)
+            self.strategy.step_post_backward(*common, step, self.info, packed=False)
             losses.append(float(loss.detach()))
         return losses
 
@@ -108,14 +93,8 @@ class VanillaPipeline(torch.nn.Module):
 def recipe() -> dict[str, Any]:
     """The classes that the documentation's blocks make."""
     section = DROP_IN.read_text(encoding="utf-8").split("## Nerfstudio's splatfacto")[1].split("\n## ")[0]
-    names: dict[str, Any] = {
-        "SplatfactoModel": SplatfactoModel,
-        "VanillaPipeline": VanillaPipeline,
-        "MAX_STEPS": 14,
-        "TurboStep": TurboStep,
-        "torch": torch,
-        "TurboDensityStrategy": TurboDensityStrategy,
-    }
+    known = (SplatfactoModel, VanillaPipeline, TurboStep, TurboDensityStrategy)
+    names: dict[str, Any] = {each.__name__: each for each in known} | {"MAX_STEPS": 14, "torch": torch}
     for block in re.findall(r"^```python\n(.*?)^```$", section, re.DOTALL | re.MULTILINE):
         exec(block, names)
     return names

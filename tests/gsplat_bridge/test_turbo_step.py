@@ -145,6 +145,7 @@ def with_item(**changes: Any) -> list[dict[str, Any]]:
         ({"splats": {"bias": torch.zeros(3)}}, r"'bias'\] has shape \(3,\): expected 40 rows"),
         ({"splats": {"means": torch.zeros(40, 3, dtype=torch.float64)}}, r"'means'\] is of torch.float64"),
         ({"splats": {"shN": torch.zeros(40, 5, 3)}}, "bands of shN = 5"),
+        ({"splats": {"scales": torch.zeros(39, 3)}}, r"'scales' has shape \(39, 3\): expected \[N, 3\] with N = 40"),
         ({"rates": ("means",)}, "optimizers has no 'means'"),
         ({"max_steps": 0}, "max_steps = 0"),
         ({"scene_scale": -1.0}, "scene_scale = -1.0"),

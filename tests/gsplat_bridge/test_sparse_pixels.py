@@ -30,18 +30,12 @@ def test_a_step_has_the_pixels_of_an_image_and_it_says_so(num_views, batch_size,
     assert f"sparse_budget: {expected.views} views a step, {expected.rate:.0%} of the pixels" in line and given in line
 
 
-@pytest.mark.parametrize(
-    ("words", "given"),
-    [
-        ("use_bilateral_grid=True does not work with sparse pixels", (5, 1, SimpleNamespace(use_bilateral_grid=True))),
-        ("post_processing='ppisp' does not work", (5, 1, SimpleNamespace(post_processing="ppisp"))),
-        ("num_views = 0", (0,)),
-        ("batch_size = 0", (5, 0)),
-        ("batch_size = 6", (5, 6)),
-    ],
-)
-def test_what_cannot_be_is_refused_by_name(words, given):
-    assert_refused(words, sparse_budget, *given)
+def test_budgets_that_cannot_be_are_refused_by_name():
+    grid, processing = SimpleNamespace(use_bilateral_grid=True), SimpleNamespace(post_processing="ppisp")
+    assert_refused("use_bilateral_grid=True does not work with sparse pixels", sparse_budget, 5, 1, grid)
+    assert_refused("post_processing='ppisp' does not work", sparse_budget, 5, 1, processing)
+    for words, given in {"num_views = 0": (0,), "batch_size = 0": (5, 0), "batch_size = 6": (5, 6)}.items():
+        assert_refused(words, sparse_budget, *given)
 
 
 @dataclass
@@ -86,13 +80,12 @@ def test_masks_of_a_trainset_are_heeded(of_first):
     assert maps.view_means()[0] == pytest.approx(float((images[0].sum(dim=-1) / 255)[mask].mean()), rel=1e-3)
 
 
-@pytest.mark.parametrize("image", [torch.zeros(20, 30, 4), np.zeros((20, 30, 3))], ids=["RGBA", "numpy"])
-def test_what_is_no_image_of_three_colours_is_refused_by_name(image):
-    found = "ndarray" if isinstance(image, np.ndarray) else r"\(20, 30, 4\)"
-    words = rf"^trainset\[1\]\['image'\] is {found}: expected a tensor \[H, W, 3\]"
-    assert_refused(words, maps_of_photos, [{"image": torch.zeros(20, 30, 3)}, {"image": image}])
-
-
-def test_a_data_set_of_patches_is_refused():
-    patches = Photos(torch.zeros(2, 8, 8, 3), patch_size=8)
-    assert_refused("trainset needs whole images, its patch_size is 8", maps_of_photos, patches)
+def test_what_is_no_data_set_of_images_is_refused_by_name():
+    good, place = {"image": torch.zeros(20, 30, 3)}, r"^trainset\[1\]\['image'\] is"
+    refused = {
+        rf"{place} \(20, 30, 4\): expected a tensor \[H, W, 3\]": [good, {"image": torch.zeros(20, 30, 4)}],
+        rf"{place} ndarray: expected a tensor \[H, W, 3\]": [good, {"image": np.zeros((20, 30, 3))}],
+        "trainset needs whole images, its patch_size is 8": Photos(torch.zeros(2, 8, 8, 3), patch_size=8),
+    }
+    for words, trainset in refused.items():
+        assert_refused(words, maps_of_photos, trainset)
