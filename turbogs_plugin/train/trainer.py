@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from turbogs_plugin.captures.depth_maps import depth_maps
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine, engine_of
 from turbogs_plugin.engine.exposures import exposure_rate
@@ -56,7 +58,8 @@ class Trainer(TrainingState):
         self.loss = config.build("loss")
         self.depths: InverseDepths | None = None
         if self.loss.terms is not None and self.loss.terms.depth_weight > 0:
-            self.depths = InverseDepths.of(scene.train, scene.points).to(device)
+            maps = depth_maps(Path(config.scene.path), scene.train, scene.frame.scale)
+            self.depths = InverseDepths.of(scene.train, scene.points, maps).to(device)
         self.clearance: Clearance | None = None
         if config.train.camera_clearance and not scene.drawn_points:
             self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)
