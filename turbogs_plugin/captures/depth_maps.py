@@ -21,15 +21,15 @@ FEWEST, METRIC = 20, 0.1  # a map is metric where its median ratio to points' de
 
 def depth_maps(folder: Path, views: PosedImages, unit: float) -> Maps | None:
     """What gives the maps of photos without a lens; None where there is none. `unit`: the scene's, in the capture's."""
-    content, named = parse_json(text_of(folder / FILE), FILE) if (folder / FILE).is_file() else {}, {}
+    content = parse_json(text_of(folder / FILE), FILE) if (folder / FILE).is_file() else {}
+    named: dict[str, Path] = {}
     for frame in ({**content, **frame} for frame in content.get("frames", [])):
         if frame.get(KEY) and not any(frame.get(name) for name in LENS):
             parts, place = PureWindowsPath(frame["file_path"]).parts, folder / PureWindowsPath(frame[KEY]).as_posix()
             named |= {"/".join(parts[first:]): place for first in range(len(parts))}
-    files = [named.get(name) for name in views.names]
 
     def cells(view: int, known: np.ndarray) -> np.ndarray | None:
-        if (file := files[view]) is None:
+        if (file := named.get(views.names[view])) is None:
             return None
         depths, places = _read(file) / unit, []
         for count, side, have in zip(known.shape, views.cameras.sizes[view, ::-1], depths.shape, strict=True):
@@ -37,7 +37,7 @@ def depth_maps(folder: Path, views: PosedImages, unit: float) -> Maps | None:
         depths = np.nan_to_num(depths[np.ix_(*places)], posinf=0.0)
         return _fitted(np.divide(1.0, depths, where=depths > 0, out=np.zeros_like(depths)), known)
 
-    return cells if any(files) else None
+    return cells if named else None
 
 
 def _read(path: Path) -> np.ndarray:

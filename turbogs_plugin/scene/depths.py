@@ -60,9 +60,9 @@ class InverseDepths:
             told = (inverse > 0) & (np.abs(away) <= FARTHEST_MATCH).all(axis=1) & ((at >= 0) & (at < shape)).all(axis=1)
             flat = starts[shown.view_ids] + at[:, 1] * shape[:, 0] + at[:, 0]
             np.maximum.at(cells, flat[told], inverse[told].astype(np.float32))
-        for view, (width, height) in enumerate(shapes if maps is not None else ()):
+        for view, (width, height) in enumerate(shapes):
             own = cells[starts[view] : starts[view + 1]].reshape(height, width)
-            if (given := maps(view, own)) is not None:
+            if maps is not None and (given := maps(view, own)) is not None:
                 np.copyto(own, given, where=own == 0, casting="same_kind")
         share = np.count_nonzero(cells) * CELL**2 / views.cameras.sizes.prod(axis=1).sum()
         if not share:

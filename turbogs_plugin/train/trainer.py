@@ -98,14 +98,14 @@ class Trainer(TrainingState):
         rendered = self.engine.render(self.gaussians, cameras, samples, options)
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
-        if self.depths is not None:
+        if self.depths is not None and rendered.depths is not None:
             truth = replace(truth, depths=DepthPair(rendered.depths, self.depths))
         loss = self.supervise(rendered.colors, truth, step)
 
         # 8) Backward to the screen, summing for each Gaussian what step 11 needs (errors, weights, squares)
         stats = self.density.stats
-        given = {"with_statistics": stats is not None, "depth_gradients": loss.depth_gradients}
-        screen = rendered.backward(loss.color_gradients, loss.pixel_errors, **given)
+        of_colors, of_depths, told = loss.color_gradients, loss.depth_gradients, stats is not None
+        screen = rendered.backward(of_colors, loss.pixel_errors, with_statistics=told, depth_gradients=of_depths)
 
         # 9) and 10) Backward to the parameters, solve for their updates and apply them; adds to `stats`
         self.update(screen, stats, step)
