@@ -1,8 +1,7 @@
 """Losses on sampled pixels (paper section 3.7), as `LossTerms` that every engine can evaluate.
 
 Every loss here is a mean over all filled samples of the K views together, or over the listed tiles, so its gradients
-are as large as a dense mean loss has them. The samplers list no tile without a sample; one that is listed all the same
-has no loss. Formulas: `turbogs_plugin.engine.reference.losses`.
+are as large as a dense mean loss has them. Formulas: `turbogs_plugin.engine.reference.losses`.
 """
 
 from __future__ import annotations
@@ -51,8 +50,8 @@ class RuleLoss(SparseLoss):
 class CharbonnierLoss(RuleLoss):
     """The Charbonnier l1 term alone: mean over filled samples and channels of ``w (sqrt(d^2 + eps^2) - eps)``.
 
-    l1(p) is the mean over the three channels, not their sum, so it has the size of a dense L1 loss in gsplat.
-    Each entry of the gradient is at most ``w / (3 n)``, n the number of filled samples; eps is `EPSILON`.
+    It has the size of a dense L1 loss in gsplat. Each entry of the gradient is at most ``w / (3 n)``, n the number of
+    filled samples.
     """
 
 
@@ -63,19 +62,16 @@ class CharbonnierNccLoss(RuleLoss):
         L = l1 + ncc_weight * mean over tiles of lambda * mean over channels of (1 - S)
         lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
 
-    S is `correlation` or `printed_correlation`. ``grad l1`` is ``d / sqrt(d^2 + eps^2)`` and ``grad S`` is
-    g, the gradients that the appendix prints. lambda takes their L1 norms over channels, and means over the tile's
-    samples (by their shares). Both gradients lack 1 / n, so the two terms compare as they enter L. lambda is constant
-    in the backward pass. The structure term's gradient is *added*: the appendix's minus would lower the correlation.
+    `engine.reference.losses.sparse_loss` defines it. The structure term's gradient is *added*: the appendix's minus
+    would lower the correlation.
 
-    In every tile, each entry of the gradient is at most ``w / (3 n) + ncc_weight / T`` (n filled samples, T tiles):
-    lambda keeps the sum of the structure term's gradients in a tile below the sum of l1's. The gradient is exactly 0
-    where x = y; the structure term's is 0 also in tiles of one sample, or constant in both x and y.
+    Each entry of the gradient is at most ``w / (3 n) + ncc_weight / T`` (n filled samples, T tiles): lambda keeps the
+    sum of the structure term's gradients in a tile below the sum of l1's. It is exactly 0 where x = y.
 
     Args:
         ncc_weight: factor of the structure term; 1 in the paper.
-        structure: similarity S of a tile: `ncc`, with a variance floor in numerator and denominator, so that a flat
-            tile scores 1; or `printed_ncc`, as the appendix has it: a flat tile scores 0.
+        structure: similarity S of a tile: `ncc`, by whose variance floor a flat tile scores 1; or the appendix's
+            `printed_ncc`, by which it scores 0.
         variance_constant: c, variance below which a tile counts as flat; SSIM's by default. NCC's floor is c / 2. The
             printed NCC adds it as its epsilon to a product of two variances: 1e-6 there means two variances of 1e-3.
     """

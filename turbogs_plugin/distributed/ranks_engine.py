@@ -117,7 +117,7 @@ class RanksEngine:
         self._passes += 1
         batch = Batch(rank, self.engine, self._exchange, gaussians, cameras, samples, options, shares)
         depths = torch.zeros(len(samples), device=self.device) if options.with_depth else None
-        if depths is not None and rendered is not None:
+        if depths is not None and rendered is not None and rendered.depths is not None:
             depths[own.slots] = rendered.depths
         return SharedRendered(colors, colors[:0, 0], depths, batch, rendered)
 
@@ -215,7 +215,9 @@ class SharedRendered(Rendered):
         plain = None
         if self._rendered is not None:
             slots = self.batch.shares[self.batch.rank].slots
-            parts = {name: None if value is None else value[slots] for name, value in vars(upstream).items()}
+            parts: dict[str, Any] = {
+                name: None if value is None else value[slots] for name, value in vars(upstream).items()
+            }
             plain = self._rendered.backward(**parts, with_statistics=with_statistics).plain()
         return SharedScreen(self.batch, plain)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,8 @@ from turbogs_plugin.types import PixelSamples
 CELL = 4
 """Side in pixels of a cell, all of which has the depth of the point that the photo shows in it. On a surface turned
 away by an angle a that is off by at most ``4 sqrt(2) tan(a) / focal length`` of itself; at an edge by any amount."""
+Maps = Callable[[int, np.ndarray], np.ndarray | None]
+"""What gives the inverse depths of the cells of a view, 0 for none, from those [h, w] that points tell; or None."""
 FARTHEST_MATCH = 2.0
 """Pixels between a point and where a photo shows it, along an axis, beyond which the pair tells no depth."""
 
@@ -35,9 +38,8 @@ class InverseDepths:
     share: float
 
     @classmethod
-    def of(cls, views: PosedImages, points: Tensor) -> InverseDepths:
-        """Depths of the points [M, 3] that photos show; of several in a cell the nearest. They are free of cost, and as
-        exact as the reconstruction.
+    def of(cls, views: PosedImages, points: Tensor, maps: Maps | None = None) -> InverseDepths:
+        """Depths of the points [M, 3] that photos show; of several in a cell the nearest; elsewhere what `maps` give.
 
         Raises:
             InputError: no depth is known.
@@ -58,9 +60,16 @@ class InverseDepths:
             told = (inverse > 0) & (np.abs(away) <= FARTHEST_MATCH).all(axis=1) & ((at >= 0) & (at < shape)).all(axis=1)
             flat = starts[shown.view_ids] + at[:, 1] * shape[:, 0] + at[:, 0]
             np.maximum.at(cells, flat[told], inverse[told].astype(np.float32))
+        for view, (width, height) in enumerate(shapes):
+            own = cells[starts[view] : starts[view + 1]].reshape(height, width)
+            if maps is not None and (given := maps(view, own)) is not None:
+                np.copyto(own, given, where=own == 0, casting="same_kind")
         share = np.count_nonzero(cells) * CELL**2 / views.cameras.sizes.prod(axis=1).sum()
         if not share:
-            raise InputError("loss.depth_weight: this capture does not say where photos show its points: set it to 0")
+            raise InputError(
+                "loss.depth_weight: this capture does not say where photos show its points, nor has it depth maps: set "
+                "it to 0"
+            )
         return cls(torch.from_numpy(cells), torch.from_numpy(starts[:-1]), min(1.0, float(share)))
 
     def to(self, device: torch.device | str) -> InverseDepths:

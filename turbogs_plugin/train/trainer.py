@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from turbogs_plugin.captures.depth_maps import depth_maps
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine import Engine, engine_of
 from turbogs_plugin.engine.exposures import exposure_rate
@@ -55,7 +57,8 @@ class Trainer(TrainingState):
         self.loss = config.build("loss")
         self.depths: InverseDepths | None = None
         if self.loss.terms is not None and self.loss.terms.depth_weight > 0:
-            self.depths = InverseDepths.of(scene.train, scene.points).to(device)
+            maps = depth_maps(Path(config.scene.path), scene.train, scene.frame.scale)
+            self.depths = InverseDepths.of(scene.train, scene.points, maps).to(device)
         self.clearance: Clearance | None = None
         if config.train.camera_clearance and not scene.drawn_points:
             self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)
@@ -94,14 +97,14 @@ class Trainer(TrainingState):
         rendered = self.engine.render(self.gaussians, cameras, samples, options)
 
         # 6) Sparse loss and its gradients, and 7) EMA update of the error maps
-        if self.depths is not None:
+        if self.depths is not None and rendered.depths is not None:
             truth = replace(truth, depths=DepthPair(rendered.depths, self.depths))
         loss = self.supervise(rendered.colors, truth, step)
 
         # 8) Backward to the screen, summing for each Gaussian what step 11 needs (errors, weights, squares)
         stats = self.density.stats
-        given = {"with_statistics": stats is not None, "depth_gradients": loss.depth_gradients}
-        screen = rendered.backward(loss.color_gradients, loss.pixel_errors, **given)
+        of_colors, of_depths, told = loss.color_gradients, loss.depth_gradients, stats is not None
+        screen = rendered.backward(of_colors, loss.pixel_errors, with_statistics=told, depth_gradients=of_depths)
 
         # 9) and 10) Backward to the parameters, solve for their updates and apply them; adds to `stats`
         self.update(screen, stats, step)

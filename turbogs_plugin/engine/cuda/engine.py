@@ -23,7 +23,7 @@ from turbogs_plugin.engine.render_pass import DEFAULT_OPTIONS, RenderOptions, Sc
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.engine.shared import PassMemory, SharedEngine
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.types import Cameras, Gaussians, LossOutput, PixelSamples
+from turbogs_plugin.types import BLACK, Cameras, Gaussians, LossOutput, PixelSamples
 
 
 class CudaEngine(SharedEngine):
@@ -88,8 +88,8 @@ class CudaEngine(SharedEngine):
     def evaluate_and_learn(
         self, terms: LossTerms, colors: Tensor, targets: Tensor, samples: PixelSamples, update: MapUpdate
     ) -> LossOutput:
-        shared = {"overflow": self.overflow, "workspace": self.workspace}
-        return training.sparse_loss(terms, colors, targets, samples, update=update, **shared)
+        shared = update, self.overflow, BLACK, self.workspace
+        return training.sparse_loss(terms, colors, targets, samples, None, *shared)
 
     def learn_exposures(
         self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float

@@ -1,0 +1,70 @@
+"""Depth maps that a ``transforms.json`` names for its photos (nerfstudio's ``depth_file_path``): images in thousandths
+of the capture's unit, or .npy in the unit; 0 is none."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path, PureWindowsPath
+
+import numpy as np
+
+from turbogs_plugin.captures.capture import text_of
+from turbogs_plugin.captures.decoding import opened_image
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.depths import CELL, Maps
+from turbogs_plugin.scene.scene import PosedImages
+from turbogs_plugin.yaml_json import parse_json
+
+FILE, KEY, LENS = "transforms.json", "depth_file_path", ("k1", "k2", "k3", "k4", "p1", "p2")
+FEWEST, METRIC = 20, 0.1  # a map is metric where its median ratio to points' depths is so near 1, or of fewer cells
+
+
+def depth_maps(folder: Path, views: PosedImages, unit: float) -> Maps | None:
+    """What gives the maps of photos without a lens; None where there is none. `unit`: the scene's, in the capture's."""
+    content = parse_json(text_of(folder / FILE), FILE) if (folder / FILE).is_file() else {}
+    named: dict[str, Path] = {}
+    for frame in ({**content, **frame} for frame in content.get("frames", [])):
+        if frame.get(KEY) and not any(frame.get(name) for name in LENS):
+            parts, place = PureWindowsPath(frame["file_path"]).parts, folder / PureWindowsPath(frame[KEY]).as_posix()
+            named |= {"/".join(parts[first:]): place for first in range(len(parts))}
+
+    def cells(view: int, known: np.ndarray) -> np.ndarray | None:
+        if (file := named.get(views.names[view])) is None:
+            return None
+        depths, places = _read(file) / unit, []
+        for count, side, have in zip(known.shape, views.cameras.sizes[view, ::-1], depths.shape, strict=True):
+            places.append(((np.arange(count) + 0.5) * CELL / side * have).astype(int).clip(max=have - 1))
+        depths = np.nan_to_num(depths[np.ix_(*places)], posinf=0.0)
+        return _fitted(np.divide(1.0, depths, where=depths > 0, out=np.zeros_like(depths)), known)
+
+    return cells if named else None
+
+
+def _read(path: Path) -> np.ndarray:
+    """[H, W] float64 depths in the capture's unit. Raises `InputError` for what is no map of 16 bits or more."""
+    npy = path.suffix.lower() == ".npy"
+    try:
+        with nullcontext() if npy else opened_image(path) as image:
+            values = np.load(path, mmap_mode="r", allow_pickle=False).squeeze() if npy else np.asarray(image)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(f"cannot read the depth map {path}: {str(error)[:120]}; export it as .npy or .png") from None
+    if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype.itemsize < 2:
+        raise InputError(f"depth map {path} has {values.dtype} of {values.shape}: export one channel of 16 bits")
+    return np.asarray(values, dtype=np.float64) * (1.0 if npy else 1e-3)
+
+
+def _fitted(given: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The map's inverse depths where it is metric; else what its numbers, as depths or inverse ones, make by the scale
+    and shift that bring them nearest to the points' inverse depths: least squares, of the half that fits best."""
+    both = (given > 0) & (known > 0)
+    if both.sum() < FEWEST or abs(np.median(given[both] / known[both]) - 1) <= METRIC:
+        return given
+    found = []
+    for numbers in (given, np.divide(1.0, given, where=given > 0, out=np.zeros_like(given))):
+        kept = both
+        for _ in range(2):
+            fit = np.polyval(np.polyfit(numbers[kept], known[kept], 1), numbers)
+            errors = np.where(both, np.abs(fit - known), np.inf)
+            kept = errors <= np.median(errors[both])
+        found.append((np.median(errors[both]), np.where(given > 0, fit.clip(min=0), 0.0)))
+    return min(found, key=lambda pair: pair[0])[1]
