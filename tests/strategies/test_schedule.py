@@ -20,8 +20,7 @@ def test_both_ends(schedule):
     end = schedule().query(step(3500), 0.3, 0.3, 100)
     after = schedule().query(step(4999), 0.3, 0.3, 100)
     assert (start.views, start.rate) == (10, pytest.approx(0.1))
-    assert (end.views, end.rate) == (3, pytest.approx(1 / 3))
-    assert after == end
+    assert (end.views, end.rate) == (3, pytest.approx(1 / 3)) and after == end
 
 
 @pytest.mark.parametrize(
@@ -45,8 +44,7 @@ def test_pixels_of_an_iteration_stay_at_the_budget(budget, num_views):
     schedule = SinusoidalSchedule(pixel_budget=budget)
     for iteration in range(0, 5000, 100):
         drawn = schedule.query(step(iteration), 0.1, 0.3, num_views)
-        assert 1 <= drawn.views <= num_views
-        assert drawn.rate <= 1
+        assert 1 <= drawn.views <= num_views and drawn.rate <= 1
         # K is rounded to a whole number, which moves the product by up to a quarter.
         assert drawn.views * drawn.rate == pytest.approx(min(budget, drawn.views), rel=0.25)
 

@@ -64,18 +64,15 @@ def test_a_stopped_run_is_refused(tmp_path):
         study_of_runs([run])
 
 
-@pytest.mark.parametrize(
-    ("second", "names"),
-    [
-        (["scene.path=/a/fox"], ["fox"]),
-        (["scene.path=/b/fox"], ["fox", "fox-2"]),
-        (["scene.path=/a/fox", "scene.factor=2"], ["fox", "fox-2"]),
-    ],
-)
-def test_captures_that_share_a_name_are_kept_apart(tmp_path, second, names):
-    runs = [a_run(tmp_path / "x", 30, "scene.path=/a/fox"), a_run(tmp_path / "y", 30, "train.seed=1", *second)]
+def test_captures_that_share_a_name_are_kept_apart(tmp_path):
+    others = {"same": "/a/fox", "b": "/b/fox", "half": "/a/fox scene.factor=2"}
+    runs = [
+        a_run(tmp_path / name, 30, f"train.seed={seed}", *f"scene.path={place}".split())
+        for seed, (name, place) in enumerate({"x": "/a/fox", **others}.items())
+    ]
     study = study_of_runs(runs)
-    assert study.scenes == names and list(study.ablation.variants) == ["x"]
+    assert [result.scene for result in study.results] == ["fox", "fox", "fox-2", "fox-3"]
+    assert list(study.ablation.variants) == ["x"]
 
 
 def test_runs_that_were_asked_the_same_are_seeds_whatever_plan_and_budgets_made_of_it(tmp_path):

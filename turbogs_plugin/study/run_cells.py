@@ -99,11 +99,8 @@ def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | Non
 
 
 def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, here: Provenance) -> list[str]:
-    """Train, in this process, the cells that the folder has not and no other process trains; what broke.
-
-    Raises:
-        InputError: a capture cannot be read, or is another one than the finished cells'.
-    """
+    """Train, in this process, the cells that the folder has not and no other process trains; what broke. Raises
+    `InputError` where a capture cannot be read, or is another one than the finished cells'."""
     device, configs = resolve_device(choice.device), choice.configs(ablation)
     warm: set[tuple[str, str]] = set()  # variants and captures
     broken: list[str] = []
