@@ -8,7 +8,6 @@ import torch
 from helpers.refusals import assert_refused
 
 from turbogs_plugin.captures import load_scene, write_demo_capture
-from turbogs_plugin.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -47,11 +46,9 @@ def test_is_a_function_of_the_seed(tmp_path, capture):
 
 def test_nothing_is_written_over(tmp_path, capture):
     before = {path: path.stat().st_mtime_ns for path in capture.rglob("*")}
-    with pytest.raises(InputError, match="is there already"):
-        write_demo_capture(capture)
+    assert_refused("is there already", write_demo_capture, capture)
     assert {path: path.stat().st_mtime_ns for path in capture.rglob("*")} == before
-    with pytest.raises(InputError, match="at least 3"):
-        write_demo_capture(tmp_path / "few", views=2)
+    assert_refused("at least 3", write_demo_capture, tmp_path / "few", views=2)
     assert not list(tmp_path.iterdir())
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -213,8 +214,8 @@ def test_what_a_file_says_is_not_said_again_for_each_frame(tmp_path):
 def test_paths_of_the_machine_that_wrote_it(tmp_path, written):
     """Of Windows, absolute, or from another folder: the end that is there counts."""
     folder = write_transforms(tmp_path / "cup")
-    (folder / "f3.png").write_bytes((folder / "images" / "f0.png").read_bytes())  # a shorter end
-    (folder / "shade.png").write_bytes((folder / "images" / "f0.png").read_bytes())
+    for name in ("f3.png", "shade.png"):  # a shorter end, a mask
+        shutil.copy(folder / "images/f0.png", folder / name)
     (folder / "images" / "f6.png").rename(tmp_path / "f6.png")  # outside of the capture
 
     def change(content):
@@ -263,9 +264,9 @@ def test_photos_in_another_folder_are_found_by_their_names(tmp_path, written, li
     for view in range(9):
         (folder / lie.format(view)).parent.mkdir(parents=True, exist_ok=True)
         (folder / f"images/f{view}.png").rename(folder / lie.format(view))
-    for beside in ("shade", "depth"):
-        (folder / beside).mkdir()
-        (folder / beside / "f3.png").write_bytes((folder / lie.format(3)).read_bytes())
+    for beside in ("shade/f3.png", "depth/f3.png"):
+        (folder / beside).parent.mkdir()
+        shutil.copy(folder / lie.format(3), folder / beside)
     edit(folder, lambda content: [f.update(file_path=written.format(i)) for i, f in enumerate(content["frames"])])
     edit(folder, lambda content: content["frames"][3].update(mask_path="shade/f3.png"))
     scene = load_scene(folder)
@@ -278,7 +279,7 @@ def test_photos_in_another_folder_that_may_be_others_are_not_taken(tmp_path):
     folder = write_transforms(tmp_path / "cup")
     (folder / "images").rename(folder / "old")
     (folder / "rgb").mkdir()
-    (folder / "rgb/f2.png").write_bytes((folder / "old/f2.png").read_bytes())
+    shutil.copy(folder / "old/f2.png", folder / "rgb")
     left_out = "1 of 9 images are left out, their photos do not exist: images/f2.png"
     assert left_out in load_scene(folder).notes
     (folder / "rgb/f2.png").unlink()
