@@ -64,6 +64,7 @@ def test_colors_of_points_are_scaled_by_their_type(kind, given, read):
         )
 
 
+BAD = ("absent.png", 7, "../../secret.png")
 BEYOND_FLOAT32 = (("fl_x", 3e-307), ("fl_x", 1e299), ("cy", -3e231), ("cx", 1e40), ("fl_y", 1e-45))
 
 
@@ -79,12 +80,17 @@ def of_all_poses(function):
     return lambda content: [f.update(transform_matrix=function(f["transform_matrix"])) for f in content["frames"]]
 
 
+def opencv(pose):
+    return (np.array(pose) @ np.diag([1, -1, -1, 1])).tolist()
+
+
 @pytest.mark.parametrize(
     "change",
     [
         lambda content: content.update(k1=None, p1=None, ply_file_path=None, train_filenames=None, val_filenames=[]),
         lambda content: content.update(w="20", h="10", fl_x="25.0", k1="0"),
         lambda content: content.update(camera_model="pinhole"),
+        lambda content: (of_all_poses(opencv)(content), content.update(axes="opencv")),
         of_all_poses(lambda pose: np.ravel(pose).tolist()),
         of_all_poses(lambda pose: np.transpose(pose).tolist()),
         of_all_poses(lambda pose: np.ravel(pose)[:12].tolist()),
@@ -185,6 +191,13 @@ def test_frames_to_test_on(tmp_path):
         (set_poses(None), "f0.png' is no matrix of 4x4 numbers"),
         (set_poses(np.diag([1, 1, -1, 1]).tolist()), "f0.png' is not a rotation"),
         (lambda content: content.update(test_frames=[{}]), "a frame without a file_path"),
+        *(
+            (
+                lambda content, p=path: content["frames"][1].update(mask_path=p),
+                f"its mask_path of .*{path}., is not there",
+            )
+            for path in ("absent.png", 7, "../../secret.png")
+        ),
     ],
 )
 def test_what_is_refused(tmp_path, change, words):
