@@ -24,7 +24,7 @@ def require_axes(scene: Scene) -> None:
     """Refuse a scene whose photos agree with OpenCV's axes alone: `InputError` with the remedy."""
     matches, given, other = axes_votes(scene.train)
     if matches >= FEWEST_MATCHES and other > SHARE * matches and other > FACTOR * given:
-        votes = f"{other} of {matches} matches of neighbouring photos agree with OpenCV's axes, {given} with the given"
+        votes = f"{other} of {matches} matches of neighbouring photos agree with OpenCV's axes, {given} with these"
         raise InputError(f"'{scene.name}': {votes}: {OTHER_AXES_REMEDY}; scene.force=true trains all the same")
 
 
