@@ -15,7 +15,7 @@ def capture(tmp_path_factory):
     return write_demo_capture(tmp_path_factory.mktemp("demo") / "capture", views=12, width=80, height=60)
 
 
-def test_points_lie_where_photos_have_their_colour(capture):
+def test_points_lie_where_photos_have_their_colour_and_tracks_are_consistent(capture):
     scene = load_scene(capture)
     assert (len(scene.train), len(scene.test)) == (10, 2) and len(scene.points) > 1000
     cameras = scene.train.cameras
@@ -25,12 +25,8 @@ def test_points_lie_where_photos_have_their_colour(capture):
     shown = ((pixels >= 0) & (pixels < torch.tensor([80, 60]))).all(dim=1)
     seen = scene.train.photos.image(4)[pixels[shown, 1], pixels[shown, 0]]
     assert (seen - scene.point_colors[shown] / 255).abs().mean(dim=1).median() < 0.05
-
-
-def test_tracks_are_consistent(capture):
     model = pycolmap.Reconstruction(capture / "sparse/0")
-    assert model.compute_mean_track_length() > 3
-    assert model.compute_mean_reprojection_error() < 0.5
+    assert model.compute_mean_track_length() > 3 and model.compute_mean_reprojection_error() < 0.5
     assert min(point.track.length() for point in model.points3D.values()) >= 2
 
 

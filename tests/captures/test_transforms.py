@@ -64,6 +64,10 @@ def test_colors_of_points_are_scaled_by_their_type(kind, given, read):
         )
 
 
+def listed(*views: int) -> list[str]:
+    return [f"./images/f{view}.png" for view in views]
+
+
 BAD = ("absent.png", 7, "../../secret.png")
 BEYOND_FLOAT32 = (("fl_x", 3e-307), ("fl_x", 1e299), ("cy", -3e231), ("cx", 1e40), ("fl_y", 1e-45))
 
@@ -191,6 +195,13 @@ def test_frames_to_test_on(tmp_path):
         (set_poses(None), "f0.png' is no matrix of 4x4 numbers"),
         (set_poses(np.diag([1, 1, -1, 1]).tolist()), "f0.png' is not a rotation"),
         (lambda content: content.update(test_frames=[{}]), "a frame without a file_path"),
+        (
+            lambda content: content.update(test_filenames=["images/f3.png", "g.png"]),
+            "test_filenames are no split: give",
+        ),
+        (lambda content: content.update(train_filenames=listed(*range(9))), "train_filenames.* are no split"),
+        (lambda content: content.update(train_filenames=listed(1, 2, 3), test_filenames=listed(3, 4)), "are no split"),
+        (lambda content: content.update(train_filenames=listed(1, 2), test_filenames=listed(3)), "2 training images"),
         *(
             (
                 lambda content, p=path: content["frames"][1].update(mask_path=p),
@@ -315,10 +326,6 @@ def test_neighbours_with_another_suffix_that_are_no_photos(tmp_path):
     assert load_scene(folder).notes[1] == left_out.replace("of 9", "of 10")
 
 
-def listed(*views: int) -> list[str]:
-    return [f"./images/f{view}.png" for view in views]
-
-
 @pytest.mark.parametrize(
     ("lists", "train", "test", "said"),
     [
@@ -340,16 +347,3 @@ def test_lists_of_file_names_are_the_split(tmp_path, lists, train, test, said):
     assert scene.train.names == tuple(f"f{view}.png" for view in train)
     assert scene.test.names == tuple(f"f{view}.png" for view in test)
     assert said in scene.notes[0]
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ({"test_filenames": ["images/f3.png", "images/g.png"]}, "test_filenames are no split: give lists"),
-        ({"train_filenames": listed(*range(9))}, "train_filenames.* are no split"),
-        ({"train_filenames": listed(1, 2, 3), "test_filenames": listed(3, 4)}, "are no split"),
-        ({"train_filenames": listed(1, 2), "test_filenames": listed(3, 4)}, "2 training images: at least 3"),
-    ],
-)
-def test_a_split_that_cannot_be_is_one_line(tmp_path, content, message):
-    assert_refused(message, load_scene, write_transforms(tmp_path / "cup", **content))
