@@ -41,9 +41,8 @@ def unchanged(before: Scene, now: Scene, split: str) -> bool:
 @pytest.mark.parametrize(("suffix", "model"), [(".bin", "OPENCV"), (".txt", "PINHOLE")])
 def test_where_photos_show_points_is_read(tmp_path, suffix, model):
     scene = load_scene(write_tracked(tmp_path / "cup", CASE, suffix, model))
-    shown = scene.train.observations
-    assert len(shown) == 7 * 80 and len(scene.test.observations) == 80
-    expected = CASE.observations.pixels[CASE.observations.view_ids > 0]  # the first photo tests
+    shown, expected = scene.train.observations, CASE.observations.pixels[CASE.observations.view_ids > 0]
+    assert len(shown) == 7 * 80 and len(scene.test.observations) == 80  # the first photo tests
     np.testing.assert_allclose(shown.pixels, expected, atol=1e-9)
     assert shown.view_ids.tolist() == np.repeat(np.arange(7), 80).tolist()
     assert shown.point_ids.tolist() == np.tile(np.arange(80), 7).tolist()

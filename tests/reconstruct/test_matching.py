@@ -12,11 +12,9 @@ NOWHERE = np.full((500, 2), np.nan)
 
 
 def flight(count: int, spread: float) -> np.ndarray:
-    """[count, 2] degrees: a meander of `spread` metres at 48 degrees north."""
+    """[count, 2] degrees: a grid of `spread` metres at 48 degrees north."""
     side = int(np.ceil(np.sqrt(count)))
-    row, column = np.divmod(np.arange(count), side)
-    column = np.where(row % 2, side - 1 - column, column)
-    north, east = row / side * spread, column / side * spread
+    north, east = np.divmod(np.arange(count), side) * np.array(spread / side)
     return np.stack([48.0 + north / 111_195, 11.0 + east / (111_195 * np.cos(np.radians(48)))], axis=1)
 
 

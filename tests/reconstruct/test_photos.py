@@ -25,8 +25,7 @@ def picture(seed: int = 0, size: tuple[int, int] = (48, 32)) -> Image.Image:
 
 def stored(form: str = "JPEG", **options) -> bytes:
     """A photo's file."""
-    file = io.BytesIO()
-    picture().save(file, form, **options)
+    picture().save(file := io.BytesIO(), form, **options)
     return file.getvalue()
 
 
@@ -63,14 +62,11 @@ def test_photos_are_upright_for_everybody(suffix, tmp_path):
     assert {photo.size for photo in photos} == {(48, 32)} and len({photo.lens for photo in photos}) == 1
     place_photos(photos, tmp_path / "images")
     paths = [tmp_path / "images" / photo.name for photo in photos]
-    sizes = photo_sizes(paths)
-    loaded = load_photos(paths, sizes, [None] * len(paths))
+    loaded = load_photos(paths, photo_sizes(paths), [None] * len(paths))
     for view, path in enumerate(paths):
         assert Image.open(path).getexif().get(0x0112, 1) == 1
-        difference = loaded.image(view).numpy() * 255 - np.asarray(shown[path.name], dtype=np.float32)
-        assert np.abs(difference).mean() < 4, path
-        seen = pycolmap.Bitmap.read(path, True).to_array() - np.asarray(shown[path.name], dtype=np.float32)
-        assert np.abs(seen).mean() < 4, path
+        for seen in (loaded.image(view).numpy() * 255, pycolmap.Bitmap.read(path, True).to_array()):
+            assert np.abs(seen - np.asarray(shown[path.name], dtype=np.float32)).mean() < 4, path
     assert paths[0].read_bytes() == photos[0].path.read_bytes()
 
 
@@ -101,12 +97,12 @@ def test_a_photo_whose_exif_cannot_be_written_again_is_turned(tmp_path):
 
 
 def test_a_phones_photo_with_a_second_one_behind_it_is_a_jpeg(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 8
+    (tmp_path / "raw").mkdir()
     for number in range(3):
-        exif = Image.Exif()
-        exif[0x0112] = 8
-        path = tmp_path / "raw" / f"{number}.jpg"
-        path.parent.mkdir(exist_ok=True)
-        picture().save(path, format="MPO", save_all=True, append_images=[picture(1)], exif=exif, quality=95)
+        content = stored("MPO", save_all=True, append_images=[picture(1)], exif=exif, quality=95)
+        (tmp_path / f"raw/{number}.jpg").write_bytes(content)
     place_photos(read_photos(tmp_path / "raw"), tmp_path / "images")
     with Image.open(tmp_path / "images/0.jpg") as upright:
         assert (upright.format, upright.size) == ("JPEG", (32, 48))
@@ -136,9 +132,8 @@ def test_names_have_no_spaces_and_folders_are_kept(tmp_path):
     photos = read_photos(tmp_path)
     assert [photo.name for photo in photos] == ["a_b.jpg", "left/1.JPG", "left/2.png"]
     place_photos(photos, tmp_path / "out")
-    assert sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.*")) == [
-        photo.name for photo in photos
-    ]
+    placed = sorted(path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.*"))
+    assert placed == [photo.name for photo in photos]
 
 
 def test_maps_of_photos_are_no_photos(tmp_path):
@@ -170,12 +165,10 @@ PANORAMA = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
     ],
 )
 def test_unusable_photos_are_refused(changes, words, tmp_path):
-    folder = tmp_path / "photos"
-    folder.mkdir()
     good = any(len(changes) > 1 or name[0] in "35" for name in changes)
     for name, content in {**{f"{n}.jpg": picture() for n in range(4) if good}, **changes}.items():
         if isinstance(content, bytes):
-            (folder / name).write_bytes(content)
+            (tmp_path / name).write_bytes(content)
         else:
-            content.save(folder / name)
-    assert_refused(words, read_photos, folder)
+            content.save(tmp_path / name)
+    assert_refused(words, read_photos, tmp_path)

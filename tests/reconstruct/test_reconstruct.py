@@ -3,6 +3,7 @@
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -13,7 +14,6 @@ from PIL import Image
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.load import holds_photos_alone
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.reconstruct import Solution, reconstruct, run, solver
 from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups
 
@@ -35,10 +35,8 @@ def solved(tmp_path_factory) -> tuple[Path, Solution]:
     for view in (2, 5):
         exif = Image.Exif()
         exif[0x0112] = 6
-        path = photos / f"view_{view:02d}.jpg"
-        render_corner(camera_centers(COUNT)[view]).transpose(Image.Transpose.ROTATE_90).save(
-            path, quality=95, exif=exif
-        )
+        turned = render_corner(camera_centers(COUNT)[view]).transpose(Image.Transpose.ROTATE_90)
+        turned.save(photos / f"view_{view:02d}.jpg", quality=95, exif=exif)
     noise(5).resize((320, 240)).save(photos / "other.jpg")  # of the size of all
     (folder / "corner/registration.csv").write_text("#name,x,y,alt")
     with pytest.MonkeyPatch.context() as patch:
@@ -111,12 +109,10 @@ def test_other_photos_are_not_mixed_in(solved, tmp_path):
     photos, solution = solved
     fewer = shutil.copytree(photos, tmp_path / "fewer")
     (fewer / "other.jpg").unlink()
-    with pytest.raises(InputError, match=r"begun with other photos.*choose a new --out, or delete it"):
-        reconstruct(fewer, solution.scene)
+    assert_refused("begun with other photos.*choose a new --out, or delete it", reconstruct, fewer, solution.scene)
     changed = shutil.copytree(photos, tmp_path / "changed")
     (changed / "view_00.jpg").touch()
-    with pytest.raises(InputError, match="begun with other photos, or they changed"):
-        reconstruct(changed, solution.scene)
+    assert_refused("begun with other photos, or they changed", reconstruct, changed, solution.scene)
 
 
 def test_photos_that_cannot_be_solved_end_in_one_line_and_leave_nothing(tmp_path):
@@ -132,35 +128,19 @@ def test_photos_that_cannot_be_solved_end_in_one_line_and_leave_nothing(tmp_path
 def test_a_place_that_holds_something_else_is_refused(solved, tmp_path):
     photos, _ = solved
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match="holds something else"):
-        reconstruct(photos, tmp_path)
-    with pytest.raises(InputError, match="would lie among the photos"):
-        reconstruct(photos, photos / "scene")
+    assert_refused("holds something else", reconstruct, photos, tmp_path)
+    assert_refused("would lie among the photos", reconstruct, photos, photos / "scene")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-class FakeModel:
-    """A model of which only the photos and their places are known."""
-
-    def __init__(self, places: str) -> None:
-        self.places = places
-
-    def num_reg_images(self) -> int:
-        return len(self.places)
-
-
-def agreement_of(places: str) -> Agreement:
-    """Photos on a line, each with 200 matches with its neighbours; photos at g agree with all others by 40."""
-    rows = []
-    for first in range(len(places)):
-        for second in range(first + 1, len(places)):
-            agree = places[first] == places[second]
-            near = second - first < 3
-            rows.append((first, second, (200 if near else 40), agree == near))
-    table = np.array(rows)
-    true, agree = table[:, 2], table[:, 3].astype(bool)
-    names = tuple(f"{view}.jpg" for view in range(len(places)))
-    return Agreement(names, table[:, :2], np.where(agree, true, 0), np.where(agree, 0, true))
+def solve_of(places: str) -> run.Solve:
+    """A solve of photos on a line, each with 200 matches with its neighbours; photos at g agree with all others by 40.
+    Its model is known by the places alone."""
+    pairs = np.stack(np.triu_indices(len(places), 1), axis=1)
+    near, alike = pairs[:, 1] - pairs[:, 0] < 3, np.array([places[first] == places[second] for first, second in pairs])
+    matches, names = np.where(near, 200, 40), tuple(f"{view}.jpg" for view in range(len(places)))
+    agreement = Agreement(names, pairs, np.where(near == alike, matches, 0), np.where(near == alike, 0, matches))
+    return run.Solve(SimpleNamespace(places=places), agreement, consistent_groups(agreement))
 
 
 @pytest.fixture
@@ -171,11 +151,7 @@ def attempts(monkeypatch, tmp_path):
         waiting, removed = list(models), []
 
         def attempt(*arguments):
-            places = waiting.pop(0)
-            if places is None:
-                return None
-            agreement = agreement_of(places)
-            return run.Solve(FakeModel(places), agreement, consistent_groups(agreement))
+            return (places := waiting.pop(0)) and solve_of(places)
 
         monkeypatch.setattr(run, "_attempt", attempt)
         monkeypatch.setattr(solver, "without_pairs", lambda database, copy, pairs: removed.append(pairs))
@@ -212,19 +188,16 @@ def test_where_too_few_photos_register_more_features_are_looked_for(monkeypatch,
     monkeypatch.setattr(solver, "read_positions", lambda database, names: np.full((3, 2), np.nan))
     monkeypatch.setattr(solver, "match_features", lambda *arguments: None)
     monkeypatch.setattr(solver, "solve_cameras", lambda *arguments: [])
-    with pytest.raises(InputError, match="only 0 of 3 photos"):
-        reconstruct(tmp_path, tmp_path / "../scene")
+    assert_refused("only 0 of 3 photos", reconstruct, tmp_path, tmp_path / "../scene")
     assert done == efforts
 
 
 def test_a_small_part_of_the_photos_is_not_taken_for_the_scene(monkeypatch, solved, tmp_path):
-    part = run.Solve(FakeModel("ooo"), agreement_of("ooo"), [[0, 1, 2]])
-    monkeypatch.setattr(run, "_solve", lambda *arguments: (part, []))
+    monkeypatch.setattr(run, "_solve", lambda *arguments: (solve_of("ooo"), []))
     for name in ("extract_features", "match_features"):
         monkeypatch.setattr(solver, name, lambda *arguments: None)
     monkeypatch.setattr(solver, "read_positions", lambda database, names: np.full((8, 2), np.nan))
-    with pytest.raises(InputError, match=r"only 3 of 8 photos: take sharp photos"):
-        reconstruct(solved[0], tmp_path / "scene")
+    assert_refused("only 3 of 8 photos: take sharp photos", reconstruct, solved[0], tmp_path / "scene")
 
 
 def test_photos_at_a_ghost_are_taken_out_of_the_model(solved, tmp_path, monkeypatch):
@@ -265,21 +238,12 @@ def test_train_finds_the_cameras_of_photos_first(solved, tmp_path, turbogs, monk
     photos, solution = solved
     shutil.copytree(solution.scene, tmp_path / "corner-scene")
     monkeypatch.setattr(run, "solver", None)
-    short = (
-        "train.iterations=2",
-        "train.sh_degree=0",
-        "train.refine_cameras=false",
-        "train.backdrop=false",
-        "--factor",
-        "8",
-        "--device",
-        "cpu",
-    )
-    code, _, err = turbogs("train", photos, "--out", tmp_path / "run", "--no-report", *short)
+    short = ("train.iterations=2", "train.sh_degree=0", "train.refine_cameras=false", "train.backdrop=false")
+    options = ("--no-report", "--device", "cpu", "--factor", "8")
+    code, _, err = turbogs("train", photos, "--out", tmp_path / "run", *options, *short)
     assert code == 0, err
-    first, *others = err.splitlines()
-    assert first == f"{photos} has photos alone: their cameras are found first, into {tmp_path / 'corner-scene'}"
-    assert others[: len(solution.notes)] == list(solution.notes)
+    said = f"{photos} has photos alone: their cameras are found first, into {tmp_path / 'corner-scene'}"
+    assert err.splitlines()[: 1 + len(solution.notes)] == [said, *solution.notes]
     assert f"path: {tmp_path / 'corner-scene'}" in (tmp_path / "run/config.yaml").read_text()
 
 
@@ -324,8 +288,8 @@ def test_masks_go_with_their_photos(solved, tmp_path, monkeypatch):
 def test_a_reconstruction_in_parts_is_not_taken_for_photos_alone(solved, tmp_path):
     scene = shutil.copytree(solved[1].scene, tmp_path / "scene")
     (scene / "sparse/0/points3D.bin").unlink()
-    assert not holds_photos_alone(scene) and not holds_photos_alone(scene / "images")  # give the capture, says a line
-    assert holds_photos_alone(solved[0].parent) and not holds_photos_alone(tmp_path)
+    assert not any(map(holds_photos_alone, (scene, scene / "images", tmp_path)))  # give the capture, says a line
+    assert holds_photos_alone(solved[0].parent)
 
 
 def test_a_scene_is_made_once_by_two_calls(solved, tmp_path, monkeypatch):

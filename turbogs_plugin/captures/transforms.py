@@ -1,7 +1,7 @@
 """Cameras in JSON: ``transforms.json`` of nerfstudio and instant-ngp, and NeRF-synthetic's ``transforms_train.json``.
 
-Cameras have OpenGL's axes (x right, y up, z backward). NeRF-synthetic tells training and test photos apart by file; its
-photos are named without a suffix and often transparent.
+Cameras have OpenGL's axes (x right, y up, z backward); by ``"axes": "opencv"``, a key of this project, OpenCV's.
+NeRF-synthetic tells training and test photos apart by file; its photos are named without a suffix, often transparent.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from turbogs_plugin.captures.photo_files import file_named, find_named
 from turbogs_plugin.captures.starting_points import clouds_beside, read_cloud
 from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens, lens_of_camera
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.agreement import OTHER_AXES
 from turbogs_plugin.scene.geometry import viewmat_of_pose
 from turbogs_plugin.yaml_json import parse_json, require_json_size
 
@@ -126,7 +127,7 @@ def _capture(
     return Capture(
         names=found.names,
         photo_folder=found.folder,
-        viewmats=np.array(viewmats),
+        viewmats=(OTHER_AXES if content.get("axes") == "opencv" else np.eye(4)) @ viewmats,
         Ks=np.array(Ks),
         sizes=np.array(sizes),
         points=points,

@@ -22,8 +22,8 @@ CELLS = 40
 LEAST_LIKENESS, LIKENESS, FEWEST_COLORS = 0.2, 0.4, 500
 """Likeness below which photos do not show the points, the likeness that explains it, and the places that tell. Five
 captures have 0.57 to 0.82; with inverse poses 0.08 at most, with poses of other photos or a shifted cloud 0.27."""
-OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Camera axes x right, y down, z forward to axes x right, y up, z backward, and back."""
+OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y down, z forward to x right, y up, z backward, and back
+OTHER_AXES_REMEDY = 'write "axes": "opencv" into transforms.json, or multiply columns 2 and 3 of each pose by -1'
 
 
 def require_agreement(scene: Scene) -> None:
@@ -72,7 +72,7 @@ def _contradiction(scene: Scene) -> str:
     elif places >= min(FEWEST_PLACES, len(scene.points)):
         return ""
     for other, remedy in (
-        (OTHER_AXES @ poses, "multiply columns 2 and 3 of each camera-to-world matrix by -1 (its axes are others)"),
+        (OTHER_AXES @ poses, f"{OTHER_AXES_REMEDY} (its axes are others)"),
         (np.linalg.inv(poses), "invert each pose's matrix (camera to world is taken for world to camera)"),
     ):
         if likeness(scene, other)[1] >= LIKENESS:

@@ -62,6 +62,10 @@ def open_scene(settings: SceneConfig, refine: bool, ranks: Ranks = ONE, trained:
     scene = load_scene(settings.path, settings.factor, settings.test_every, progress, settings.validation)
     if not (settings.force or trained):
         require_agreement(scene)
+        if scene.drawn_points:
+            from turbogs_plugin.reconstruct.axes import require_axes  # no other capture needs that room
+
+            require_axes(scene)
     if note := unseeing_note(scene):
         scene = replace(scene, notes=(*scene.notes, note))
     cameras = find_cameras(scene, refine) if ranks.first else None
