@@ -80,13 +80,11 @@ def test_whatever_is_new_is_drawn_again(monkeypatch):
 @pytest.mark.parametrize("per_pixel", [1e-9, 1e-8, 1e-6])
 def test_frames_take_their_share_of_a_training_and_no_more(monkeypatch, per_pixel):
     desk = Desk(monkeypatch, per_pixel)
-    began, drawing, iterations = desk.now, 0.0, 0
+    began, drawing = desk.now, 0.0
     while desk.now < began + 20.0:
         desk.wait(0.001)  # an iteration
-        iterations += 1
-        desk.look(desk.now)
-        before = desk.now
-        desk.serve(version=iterations, running=True)
+        desk.look(before := desk.now)
+        desk.serve(version=int(1000 * before), running=True)
         drawing += desk.now - before
     # The last frame's pause may lie beyond the end.
     assert drawing <= SHARE * (desk.now - began) + FEWEST_PIXELS * per_pixel

@@ -31,11 +31,7 @@ from turbogs_plugin.types import SH_C0, Gaussians
 from turbogs_plugin.yaml_json import parse_json
 
 TRANSFORMS = "dataparser_transforms.json"
-TURNS = tuple(np.array(turn, dtype=np.float64) for turn in (
-    [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-    [[0, 1, 0], [1, 0, 0], [0, 0, -1]],
-))  # fmt: skip
+TURNS = (np.eye(3), np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]]), np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]))
 """COLMAP's axes to those of `ns-process-data`: not at all, as it does since 1.0, and as it did before."""
 HALF_TURNS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
 POINTS_AT_MOST, GAUSSIANS_AT_MOST = 20_000, 200_000
