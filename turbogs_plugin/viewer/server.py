@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -175,8 +175,7 @@ class Page:
         self.frames.look(ViewerCamera.checked(camera.position, camera.wxyz, camera.fov, *size))
 
     def _send(self, pixels: np.ndarray, lossless: bool) -> None:
-        kind: Literal["png", "jpeg"] = "png" if lossless else "jpeg"
-        self.server.scene.set_background_image(pixels, format=kind, jpeg_quality=JPEG_QUALITY)
+        self.server.scene.set_background_image(pixels, "png" if lossless else "jpeg", jpeg_quality=JPEG_QUALITY)
 
 
 def _own_name(asked: str, host: str) -> bool:
