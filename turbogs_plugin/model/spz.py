@@ -97,9 +97,8 @@ def read_spz(path: Path) -> Gaussians:
         quats = _with_rest(rotations / 127.5 - 1.0, np.full((len(means), 1), 3))
     shares = (opacities[:, 0] / 255.0).clip(1e-4, 1.0 - 1e-4)
     sh0, shN = (colors / 255.0 - 0.5) / COLOR_SCALE, (harmonics - 128.0) / SH_SCALE
-    values = (places, quats[:, [3, 0, 1, 2]], scales / 16.0 - 10.0, np.log(shares / (1.0 - shares)))
-    values += (sh0[:, None], shN.reshape(len(means), -1, 3))
-    return upright(Gaussians(*map(torch.from_numpy, values)))
+    values = [places, quats[:, [3, 0, 1, 2]], scales / 16.0 - 10.0, np.log(shares / (1.0 - shares)), sh0[:, None]]
+    return upright(Gaussians(*map(torch.from_numpy, [*values, shN.reshape(len(means), -1, 3)])))
 
 
 def _header(content: bytes) -> tuple[Any, tuple[int, ...]]:
