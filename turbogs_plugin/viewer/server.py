@@ -217,7 +217,7 @@ def _guarded(host: str) -> Iterator[None]:
             origins, hosts = (request.headers.get_all(name) for name in ("Origin", "Host"))
             own = len(hosts) == 1 and _own_name(hosts[0], host)
             if not own or any(urlsplit(origin).netloc != hosts[0] for origin in origins):
-                return connection.respond(403, "This page has another name.\n")
+                return connection.respond(403, "This page answers to localhost and its --host alone.\n")
             return process_request(connection, request)
 
         guarded.append(host)
