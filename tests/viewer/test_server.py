@@ -22,6 +22,7 @@ from helpers.framework_runs import TINY, assert_identical
 from helpers.processes import comes_true, command_line, ended, said, start_ranks
 from helpers.viewer_client import ViewerClient
 
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.live import LiveViewer
@@ -93,6 +94,12 @@ def test_scripts_of_other_pages_are_turned_away(shown, state):
             with closing(HTTPConnection("127.0.0.1", port)) as asked:
                 asked.request("GET", "/", headers={"Host": name})
                 assert asked.getresponse().status == status
+
+
+def test_a_viser_that_serves_otherwise_is_refused(monkeypatch):
+    monkeypatch.setattr("viser.ViserServer", lambda **options: None)
+    with pytest.raises(InputError, match="cannot be kept from foreign pages"):
+        Page("127.0.0.1", 0)
 
 
 @pytest.mark.parametrize(
