@@ -28,16 +28,12 @@ def test_a_moved_model_looks_the_same_from_moved_cameras(axis_angle, sh_degree):
     gaussians.scales -= 1.5
     change = Similarity(rotation_of(axis_angle), 1.7, np.array([3.0, -2.0, 0.5]))
     viewmat = look_at(np.array([1.0, -4.0, 2.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    moved = np.eye(4)  # camera coordinates grow with the world
-    moved[:3, :3] = viewmat[:3, :3] @ change.rotation.T
-    moved[:3, 3] = change.scale * viewmat[:3, 3] - moved[:3, :3] @ change.translation
+    moved = change.apply_to_poses(viewmat[None])[0]  # camera coordinates grow with the world
     intrinsics = torch.tensor([[40.0, 0.0, 24.0], [0.0, 40.0, 20.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    images = [
-        render_image(
-            model, Cameras(torch.from_numpy(pose)[None], intrinsics[None], np.array([[48, 40]])), sh_degree=sh_degree
-        ).colors
-        for model, pose in ((gaussians, viewmat), (change.apply(gaussians), moved))
-    ]
+    images = []
+    for model, pose in ((gaussians, viewmat), (change.apply(gaussians), moved)):
+        camera = Cameras(torch.from_numpy(pose)[None], intrinsics[None], np.array([[48, 40]]))
+        images.append(render_image(model, camera, sh_degree=sh_degree).colors)
     assert images[0].std() > 0.1
     assert (images[0] - images[1]).abs().max() < 1e-5
 

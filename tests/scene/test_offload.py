@@ -107,29 +107,36 @@ def test_maps_of_both_kinds_say_the_same():
     assert_identical(both[0].state_dict(), both[1].state_dict())
 
 
+class Stream:
+    """A stream of a simulated GPU, with what copies of `offload` ask of one."""
+
+    def __init__(self, machine: "Machine") -> None:
+        self.queue, self.latest = deque(), []
+        machine.streams.append(self)
+
+    def wait(self, events) -> None:
+        self.queue += events
+
+    def copy(self, target, source) -> None:
+        self.queue.append(lambda: target.copy_(source))
+
+    def mark(self) -> list[Event]:
+        self.latest = [Event()]
+        self.queue.append(self.latest[0].set)
+        return self.latest
+
+
 class Machine:
-    """A GPU's streams, simulated: of those that may go on, chance says which one does."""
+    """A GPU's streams: of those that may go on, chance says which one does."""
 
     def __init__(self, seed: int) -> None:
-        self.choose = random.Random(seed)
-        self.streams: dict[str, deque] = {"compute": deque()}
-
-    def enqueue(self, stream: str, work) -> None:
-        self.streams.setdefault(stream, deque()).append(work)
-
-    def record(self, stream: str) -> Event:
-        event = Event()
-        self.enqueue(stream, event.set)
-        return event
-
-    def wait(self, stream: str, events) -> None:
-        for event in events:
-            self.enqueue(stream, event)
+        self.choose, self.streams = random.Random(seed), []
+        self.compute = Stream(self)
 
     def run(self, steps: float = np.inf) -> None:
         """At most `steps` of what is enqueued. An event that is not set stops its stream."""
         while steps > 0:
-            queues = [queue for queue in self.streams.values() if queue]
+            queues = [stream.queue for stream in self.streams if stream.queue]
             ready = [queue for queue in queues if not isinstance(queue[0], Event) or queue[0].is_set()]
             if not ready:
                 assert not queues, "the streams wait for each other"
@@ -146,25 +153,9 @@ def machine(monkeypatch):
 
     def make(seed: int) -> Machine:
         machine = Machine(seed)
-        names = iter("abcdefgh")
-
-        class Stream:
-            def __init__(self, device) -> None:
-                self.name, self.latest = next(names), []
-
-            def wait(self, events) -> None:
-                machine.wait(self.name, events)
-
-            def copy(self, target, source) -> None:
-                machine.enqueue(self.name, lambda: target.copy_(source))
-
-            def mark(self):
-                self.latest = [machine.record(self.name)]
-                return self.latest
-
-        monkeypatch.setattr(offload, "_CopyStream", Stream)
-        monkeypatch.setattr(offload, "_mark", lambda device: [machine.record("compute")])
-        monkeypatch.setattr(offload, "_wait", lambda device, events: machine.wait("compute", events))
+        monkeypatch.setattr(offload, "_CopyStream", lambda device: Stream(machine))
+        monkeypatch.setattr(offload, "_mark", lambda device: machine.compute.mark())
+        monkeypatch.setattr(offload, "_wait", lambda device, events: machine.compute.wait(events))
         monkeypatch.setattr(offload, "synchronize", lambda device: machine.run())
         return machine
 
@@ -188,7 +179,7 @@ def test_no_copy_is_too_early_or_too_late(machine, seed, written):
             seen.append(torch.equal(inside, expected))
             inside.add_(amount if written else 0)
 
-        gpu.enqueue("compute", change)
+        gpu.compute.queue.append(change)
         truth[start:end] += amount if written else 0
 
     for turn in range(60):

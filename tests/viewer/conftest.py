@@ -2,6 +2,7 @@
 
 import copy
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 
 import pytest
@@ -48,11 +49,9 @@ def unwatched(new_training):
 
 @pytest.fixture(scope="session")
 def untouched(new_training, scene):
-    """Not to be changed: `state` is a copy."""
     trainer = new_training().trainer
     trainer.initialise_maps()
-    views = CaptureViews(trainer.views, scene.test)
-    look = Look(trainer.sh_degree, DEFAULT_SETTINGS)
+    look, views = Look(trainer.sh_degree, DEFAULT_SETTINGS), CaptureViews(trainer.views, scene.test)
     return ModelState(trainer.gaussians, look, capture=views, maps=(trainer.maps, trainer.now))
 
 
@@ -72,20 +71,17 @@ def shown():
     @contextmanager
     def shown(state: ModelState):
         over = threading.Event()
-        with closing(Page("127.0.0.1", 0)) as page:
-            draw_due = server_of(state, "a model", page)
 
-            def serve() -> None:
-                while not over.is_set():
-                    if not draw_due():
-                        over.wait(0.02)
+        def serve(draw_due) -> None:
+            while not over.is_set():
+                if not draw_due():
+                    over.wait(0.02)
 
-            thread = threading.Thread(target=serve, daemon=True)
-            thread.start()
+        with closing(Page("127.0.0.1", 0)) as page, ThreadPoolExecutor(1) as pool:
+            pool.submit(serve, server_of(state, "a model", page))
             try:
                 yield page
             finally:
                 over.set()
-                thread.join(60.0)
 
     return shown

@@ -5,18 +5,17 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import torch
+from helpers.models import random_gaussians
 
 from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS
 from turbogs_plugin.train.look import Look
-from turbogs_plugin.types import Gaussians
 from turbogs_plugin.viewer import frames as module
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.frames import FEWEST_PIXELS, REST_SECONDS, SHARE, Frames
 from turbogs_plugin.viewer.pictures import ModelState, Picture
 
 AHEAD = ViewerCamera((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 1.0, 640, 480)
-EMPTY = Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (3,), (), (1, 3), (0, 3))))
-NOTHING = ModelState(EMPTY, Look(0, DEFAULT_SETTINGS))
+NOTHING = ModelState(random_gaussians(0, 0), Look(0, DEFAULT_SETTINGS))
 
 
 class Desk:
@@ -25,17 +24,14 @@ class Desk:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, per_pixel: float = 0.0) -> None:
         self.now = 100.0
         self.sent: list[tuple[int, bool]] = []  # width, lossless
-        self.wish = (Picture.RENDER, 0)
-        self.frames = Frames(self._take, lambda: self.wish, clock=lambda: self.now)
-        self.per_pixel = per_pixel
+        self.wish, self.per_pixel = (Picture.RENDER, 0), per_pixel
+        take = lambda pixels, lossless: self.sent.append((pixels.shape[1], lossless))  # noqa: E731
+        self.frames = Frames(take, lambda: self.wish, clock=lambda: self.now)
         monkeypatch.setattr(module, "draw", self._draw)
 
     def _draw(self, state: ModelState, picture: Picture, camera: ViewerCamera, view: int) -> tuple[np.ndarray, str]:
         self.now += self.per_pixel * camera.width * camera.height
         return np.zeros((camera.height, camera.width, 3), dtype=np.uint8), ""
-
-    def _take(self, pixels: np.ndarray, lossless: bool) -> None:
-        self.sent.append((pixels.shape[1], lossless))
 
     def look(self, x: float) -> None:
         self.frames.look(ViewerCamera((x, 0.0, 0.0), AHEAD.wxyz, AHEAD.fov, AHEAD.width, AHEAD.height))
@@ -80,13 +76,11 @@ def test_whatever_is_new_is_drawn_again(monkeypatch):
 @pytest.mark.parametrize("per_pixel", [1e-9, 1e-8, 1e-6])
 def test_frames_take_their_share_of_a_training_and_no_more(monkeypatch, per_pixel):
     desk = Desk(monkeypatch, per_pixel)
-    began, drawing, iterations = desk.now, 0.0, 0
+    began, drawing = desk.now, 0.0
     while desk.now < began + 20.0:
         desk.wait(0.001)  # an iteration
-        iterations += 1
-        desk.look(desk.now)
-        before = desk.now
-        desk.serve(version=iterations, running=True)
+        desk.look(before := desk.now)
+        desk.serve(version=int(1000 * before), running=True)
         drawing += desk.now - before
     # The last frame's pause may lie beyond the end.
     assert drawing <= SHARE * (desk.now - began) + FEWEST_PIXELS * per_pixel

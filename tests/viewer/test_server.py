@@ -22,8 +22,8 @@ from helpers.framework_runs import TINY, assert_identical
 from helpers.processes import comes_true, command_line, ended, said, start_ranks
 from helpers.viewer_client import ViewerClient
 
-from turbogs_plugin.model.formats import FORMATS
-from turbogs_plugin.scene import Frame
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.live import LiveViewer
 from turbogs_plugin.viewer.pictures import Picture, draw
@@ -31,9 +31,7 @@ from turbogs_plugin.viewer.server import INSTALL, Page, _own_name
 from turbogs_plugin.viewer.show import open_state
 
 pytest.importorskip("viser")
-ConnectionClosed, InvalidStatus = (
-    getattr(pytest.importorskip("websockets.exceptions"), name) for name in ("ConnectionClosed", "InvalidStatus")
-)
+exceptions = pytest.importorskip("websockets.exceptions")
 
 
 def test_pictures_and_views_are_chosen_on_the_page_and_moving_frames_are_jpeg(shown, state):
@@ -45,11 +43,8 @@ def test_pictures_and_views_are_chosen_on_the_page_and_moving_frames_are_jpeg(sh
             client.press(page._slider._impl.uuid, view)
             client.press(page._pictures._impl.uuid, picture.value)
             expected, _ = draw(state, picture, camera, view)
-            for _ in range(5):  # the choice of a view may be drawn on the way
-                if np.array_equal(client.next_frame(lossless=True).pixels(), expected):
-                    break
-            else:
-                pytest.fail(f"{picture.value} did not come")
+            came = (client.next_frame(lossless=True).pixels() for _ in range(5))  # perhaps after the choice of a view
+            assert any(np.array_equal(pixels, expected) for pixels in came), picture
         client.look(replace(camera, fov=camera.fov * 0.9))
         assert not client.next_frame().lossless
         client.next_frame(lossless=True)
@@ -93,12 +88,18 @@ def test_scripts_of_other_pages_are_turned_away(shown, state):
                 client.look(camera)
                 client.next_frame()
         for headers in ({}, {"Host": foreign}):  # a name of theirs that leads here is the second
-            with pytest.raises(InvalidStatus, match="403"):
+            with pytest.raises(exceptions.InvalidStatus, match="403"):
                 ViewerClient(page.url, Origin=f"http://{foreign}", **headers)
         for name, status in ((local, 200), (foreign, 403)):
             with closing(HTTPConnection("127.0.0.1", port)) as asked:
                 asked.request("GET", "/", headers={"Host": name})
                 assert asked.getresponse().status == status
+
+
+def test_a_viser_that_serves_otherwise_is_refused(monkeypatch):
+    monkeypatch.setattr("viser.ViserServer", lambda **options: None)
+    with pytest.raises(InputError, match="cannot be kept from foreign pages"):
+        Page("127.0.0.1", 0)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +117,7 @@ def test_a_page_answers_to_its_own_names(host, own, others):
 def test_garbage_of_clients_leaves_one_line(shown, state, capfd):
     with shown(state) as page:
         for garbage in (b"\xff\xfe", "text", b"\x80", b"\x90"):
-            with ViewerClient(page.url) as client, contextlib.suppress(ConnectionClosed):
+            with ViewerClient(page.url) as client, contextlib.suppress(exceptions.ConnectionClosed):
                 client._socket.send(garbage)
                 for _ in client._socket:  # until it is turned away
                     pass
@@ -151,8 +152,7 @@ def test_a_training_goes_on_while_a_client_looks_and_when_it_leaves_a_pause(new_
 def test_without_viser_one_line_names_the_extra(turbogs, tmp_path, capture, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     for command in (("view", tmp_path), ("train", capture, "--out", tmp_path / "run", "--viewer")):
-        code, out, err = turbogs(*command)
-        assert (code, out, err) == (2, "", f"turbogs: error: the viewer needs viser: {INSTALL}\n")
+        assert turbogs(*command) == (2, "", f"turbogs: error: the viewer needs viser: {INSTALL}\n")
     assert not (tmp_path / "run").exists()
 
 
@@ -203,11 +203,9 @@ def test_bad_input_is_one_line(turbogs, tmp_path, capture):
 
 
 def test_a_model_from_a_file_stands_before_the_camera(state, tmp_path):
-    far = state.gaussians.map(lambda value: value.clone())
-    far.means = far.means * 50.0 + torch.tensor([1000.0, -2000.0, 500.0])
-    file = tmp_path / "model.ply"
-    FORMATS["ply"].write(far, file, Frame(np.zeros(3), 1.0), 0, False)
-    found = open_state(file, torch.device("cpu"))
+    far = replace(state.gaussians, means=state.gaussians.means * 50.0 + torch.tensor([1000.0, -2000.0, 500.0]))
+    save_ply(far, tmp_path / "model.ply")
+    found = open_state(tmp_path / "model.ply", torch.device("cpu"))
     distances = found.gaussians.means.norm(dim=1)
     assert 0.45 < float((distances <= 1.01).float().mean()) < 0.55
     assert found.capture is None

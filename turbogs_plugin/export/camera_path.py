@@ -49,7 +49,7 @@ def orbit(cameras: Cameras, frames: int) -> Cameras:
     offsets = cameras.centers.double().cpu().numpy() - focus
     heights = offsets @ up
     flat = offsets - heights[:, None] * up
-    east = _unit(flat.mean(axis=0), _unit(flat[0], np.cross(up, [0.7, 0.1, 0.7])))
+    east = np.linalg.svd(up[None])[2][1]  # across `up`
     north = np.cross(up, east)
     angles = np.sort(np.arctan2(flat @ north, flat @ east))
     gaps = np.diff(angles, append=angles[0] + 2 * math.pi)

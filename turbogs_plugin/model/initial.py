@@ -52,9 +52,7 @@ def backdrop_gaussians(color: Tensor, sh_degree: int, extent: float) -> Gaussian
     ring = (1.0 - height * height).sqrt()
     directions = torch.stack([ring * angle.cos(), ring * angle.sin(), height], dim=1).float()
     colors = (color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).expand(BACKDROP_COUNT, 3)
-    backdrop = gaussians_from_points(directions * BACKDROP_RADIUS * extent, colors, sh_degree, extent)
-    backdrop.opacities.fill_(math.log(BACKDROP_OPACITY / (1.0 - BACKDROP_OPACITY)))
-    return backdrop
+    return gaussians_from_points(directions * BACKDROP_RADIUS * extent, colors, sh_degree, extent, BACKDROP_OPACITY)
 
 
 def with_degree(gaussians: Gaussians, degree: int) -> Gaussians:

@@ -11,15 +11,13 @@ from torch import Tensor
 from turbogs_plugin.types import Gaussians, RowUpdate
 
 POINTS, SHARE = 10, 0.9
-"""Nearest points of a camera, several as single ones may be wrong, and the largest share of its distance from them that
-its radius may be: objects photographed from near by stay."""
+"""Nearest points of a camera, as single ones may be wrong, and the largest share of its distance from them that its
+radius may be: objects photographed from near by stay."""
 RARE = 0.002
 """Share of the points that have a camera within the largest radius: where a camera stands before a wall without points,
 the wall stays."""
-POINTS_LOOKED_AT = 100_000
-"""Points that are used at most, evenly in their order."""
-DISTANCES_AT_ONCE = 1 << 22
-"""Points times cameras at a time, which bounds memory."""
+POINTS_LOOKED_AT, DISTANCES_AT_ONCE = 100_000, 1 << 22
+"""Points that are used at most, evenly in their order; points times cameras at a time, which bounds memory."""
 DISTANT = 2.0
 """Gaussians farther than this from the cameras' centre, in extents, are limited. All cameras lie within one extent of
 it, so these Gaussians are at least one extent away from every camera. A nearer limit would affect the scene itself."""

@@ -4,9 +4,8 @@ nerfstudio centres, turns and scales the poses that it trains on, and writes the
 into the folder of the training: ``new = scale * (transform @ old)``. Its old coordinates are COLMAP's, or those of a
 ``transforms.json`` by `ns-process-data`, which turns COLMAP's axes once more.
 
-gsplat's example trainer works in a world of its own (its `normalize_world_space`, on by default) and does not say
-which. Facts of `examples/datasets/normalize.py` and `colmap.py` of gsplat 1.5.3 and main; all of it from the cameras
-and points of a COLMAP reconstruction in its own coordinates:
+gsplat's example trainer works in a world of its own (`normalize_world_space`, its default), by the cameras and points
+of a COLMAP reconstruction (`examples/datasets/normalize.py` and `colmap.py` of gsplat 1.5.3 and main):
 
 1. The world is turned so that the mean of the cameras' up directions becomes (0, -1, 0), by the smallest rotation.
 2. The origin becomes the median, axis by axis, of the places nearest to the old origin on the cameras' viewing axes.
@@ -31,16 +30,11 @@ from turbogs_plugin.types import SH_C0, Gaussians
 from turbogs_plugin.yaml_json import parse_json
 
 TRANSFORMS = "dataparser_transforms.json"
-TURNS = tuple(np.array(turn, dtype=np.float64) for turn in (
-    [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-    [[0, 1, 0], [1, 0, 0], [0, 0, -1]],
-))  # fmt: skip
+TURNS = (np.eye(3), np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]]), np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]))
 """COLMAP's axes to those of `ns-process-data`: not at all, as it does since 1.0, and as it did before."""
 HALF_TURNS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
-POINTS_AT_MOST, GAUSSIANS_AT_MOST = 20_000, 200_000
-FEWEST_POINTS = 1000
-"""Points of a capture below which nothing tells that a model does not fit: they lie too far apart."""
+POINTS_AT_MOST, GAUSSIANS_AT_MOST, FEWEST_POINTS = 20_000, 200_000, 1000
+"""Numbers that are looked at; points below which nothing tells that a model does not fit: they lie too far apart."""
 FARTHEST_POINTS, FARTHEST_GAUSSIANS = 0.2, 0.13
 """Median distances, in place and colour, of points from the nearest Gaussian and of Gaussians from the nearest point,
 over the points' median distance from their middle, both of which a model exceeds that does not fit. Of five captures,

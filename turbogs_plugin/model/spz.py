@@ -90,19 +90,15 @@ def read_spz(path: Path) -> Gaussians:
         wide[:, :, 1:] = means.reshape(-1, 3, 3)  # in the upper bytes, so that the sign is theirs
         places = (wide.view("<i4")[:, :, 0] >> 8) / 2.0**bits
     if version > 2:
-        quats = _unpacked_rotations(rotations.view("<u4"))
+        words = rotations.view("<u4")
+        codes = words >> np.array([20, 10, 0], dtype=np.uint32)  # [N, 3]
+        quats = _with_rest(np.where(codes & SIGN, -1.0, 1.0) * (codes & SIZE) / UNIT, words >> 30)
     else:
         quats = _with_rest(rotations / 127.5 - 1.0, np.full((len(means), 1), 3))
     shares = (opacities[:, 0] / 255.0).clip(1e-4, 1.0 - 1e-4)
-    values = {
-        "means": places,
-        "quats": quats[:, [3, 0, 1, 2]],
-        "scales": scales / 16.0 - 10.0,
-        "opacities": np.log(shares / (1.0 - shares)),
-        "sh0": ((colors / 255.0 - 0.5) / COLOR_SCALE)[:, None],
-        "shN": (harmonics.reshape(len(means), -1, 3) - 128.0) / SH_SCALE,
-    }
-    return upright(Gaussians(**{name: torch.from_numpy(value) for name, value in values.items()}))
+    sh0, shN = (colors / 255.0 - 0.5) / COLOR_SCALE, (harmonics - 128.0) / SH_SCALE
+    values = [places, quats[:, [3, 0, 1, 2]], scales / 16.0 - 10.0, np.log(shares / (1.0 - shares)), sh0[:, None]]
+    return upright(Gaussians(*map(torch.from_numpy, [*values, shN.reshape(len(means), -1, 3)])))
 
 
 def _header(content: bytes) -> tuple[Any, tuple[int, ...]]:
@@ -167,12 +163,6 @@ def _packed_rotations(unit: np.ndarray) -> np.ndarray:
     others = _positive(unit, largest)[np.arange(4) != largest].reshape(-1, 3)
     codes = np.rint(UNIT * np.abs(others)).clip(0, SIZE).astype("<u4") | np.where(others < 0, SIGN, 0).astype("<u4")
     return largest[:, 0].astype("<u4") << 30 | codes[:, 0] << 20 | codes[:, 1] << 10 | codes[:, 2]
-
-
-def _unpacked_rotations(words: np.ndarray) -> np.ndarray:
-    """[N, 4] unit quaternions, xyzw, of what `_packed_rotations` gives, [N, 1]."""
-    codes = words >> np.array([20, 10, 0], dtype=np.uint32)  # [N, 3]
-    return _with_rest(np.where(codes & SIGN, -1.0, 1.0) * (codes & SIZE) / UNIT, words >> 30)
 
 
 def _with_rest(others: np.ndarray, place: np.ndarray) -> np.ndarray:

@@ -26,7 +26,6 @@ PLAIN = re.compile(
     r"torch (\w+Storage|Size|device|float\d+|bfloat16|u?int\d+|bool)"
 )
 """Names that a file may call. torch allows others besides, some of which take any amount of memory."""
-
 BANDS = (0, 3, 8, 15)
 """Numbers of bands of harmonics above degree 0, of the degrees 0 .. 3."""
 

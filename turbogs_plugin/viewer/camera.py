@@ -69,8 +69,7 @@ class ViewerCamera:
         return cls((x, y, z), (a, b, c, d), fov, int(width), int(height))
 
     @property
-    def rotation(self) -> np.ndarray:
-        """[3, 3] float64, from the camera to the world."""
+    def rotation(self) -> np.ndarray:  # [3, 3] float64, from the camera to the world
         return rotation_matrices(torch.tensor(self.wxyz, dtype=torch.float64)).numpy()
 
     def with_at_most(self, pixels: float) -> ViewerCamera:

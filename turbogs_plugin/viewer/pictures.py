@@ -98,18 +98,16 @@ def draw(state: ModelState, picture: Picture, camera: ViewerCamera, view: int = 
     """
     try:
         if picture is Picture.RENDER:
-            return _render(state, camera), ""
+            cameras = camera.cameras(state.gaussians.device)
+            return to_uint8(render_image(state.gaussians, cameras, **state.look.options).colors), ""
         number = min(max(0, view), len(_capture(state)) - 1)
         if picture is Picture.SAMPLES and state.samples is not None and number not in state.samples.view_ids:
             number = state.samples.view_ids[0]
-        draw_view = {Picture.COMPARE: _compare, Picture.SAMPLES: _samples, Picture.AGES: _ages}.get(picture, _errors)
-        return _centred(draw_view(state, camera, number), camera), _capture(state).name(number)
+        drawn = {Picture.COMPARE: _compare, Picture.SAMPLES: _samples}.get(picture)
+        pixels = drawn(state, camera, number) if drawn else _map(state, camera, number, picture is Picture.AGES)
+        return _centred(pixels, camera), _capture(state).name(number)
     except AbsentError as reason:
         return _centred(torch.zeros(0, 0, 3), camera), str(reason)
-
-
-def _render(state: ModelState, camera: ViewerCamera) -> np.ndarray:
-    return to_uint8(render_image(state.gaussians, camera.cameras(state.gaussians.device), **state.look.options).colors)
 
 
 def _compare(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
@@ -121,17 +119,19 @@ def _compare(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
     return _fitted(pixels.permute(2, 0, 1).float(), camera).permute(1, 2, 0).round().byte()
 
 
-def _errors(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
-    """The map's own values: a mean over the last visits of each pixel, not the error of the present model."""
-    maps, _ = _maps(state, number)
-    return _map_picture(maps.view_errors(number) / (3.0 * ERROR_FULL_SCALE), maps.sizes[number], camera)
-
-
-def _ages(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
-    """Black: sampled just now. The brightest: as long ago as the oldest pixel of the view, on a logarithmic scale."""
-    maps, step = _maps(state, number)
-    ages = torch.log1p(maps.ages(number, step).float())
-    return _map_picture(ages / ages.max().clamp(min=1e-6), maps.sizes[number], camera)
+def _map(state: ModelState, camera: ViewerCamera, number: int, of_ages: bool) -> Tensor:
+    """Errors, as the map has them: a mean over the last visits of each pixel, not the error of the present model. Or
+    ages, on a logarithmic scale from black (sampled just now) to the oldest pixel of the view. What is reduced keeps
+    its largest values."""
+    if state.maps is None or number >= len(_capture(state).train):
+        raise AbsentError("A running training keeps error maps, of its training views.")
+    maps, step = state.maps
+    shares = maps.view_errors(number) / (3.0 * ERROR_FULL_SCALE)
+    if of_ages:
+        ages = torch.log1p(maps.ages(number, step).float())
+        shares = ages / ages.max().clamp(min=1e-6)
+    width, height = maps.sizes[number].tolist()
+    return colored(_fitted(shares.view(1, height, width), camera, keep_largest=True)[0])
 
 
 def _samples(state: ModelState, camera: ViewerCamera, number: int) -> Tensor:
@@ -154,21 +154,10 @@ def _capture(state: ModelState) -> CaptureViews:
     return state.capture
 
 
-def _maps(state: ModelState, number: int) -> tuple[ErrorMaps, Step]:
-    if state.maps is None or number >= len(_capture(state).train):
-        raise AbsentError("A running training keeps error maps, of its training views.")
-    return state.maps
-
-
 def _photo(state: ModelState, number: int) -> Tensor:
     """A photo on the model's device, [H, W, 3] float32, 0 .. 1."""
     views, view_id = _capture(state).find(number)
     return views.photos.image(view_id, state.look.background).to(state.gaussians.device)
-
-
-def _map_picture(shares: Tensor, size: np.ndarray, camera: ViewerCamera) -> Tensor:
-    """A map [H * W] of a view of (width, height), in colours; what is reduced keeps its largest values."""
-    return colored(_fitted(shares.view(1, size[1], size[0]), camera, keep_largest=True)[0])
 
 
 def _fitted(planes: Tensor, camera: ViewerCamera, keep_largest: bool = False) -> Tensor:

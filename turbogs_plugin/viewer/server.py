@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -175,8 +175,7 @@ class Page:
         self.frames.look(ViewerCamera.checked(camera.position, camera.wxyz, camera.fov, *size))
 
     def _send(self, pixels: np.ndarray, lossless: bool) -> None:
-        kind: Literal["png", "jpeg"] = "png" if lossless else "jpeg"
-        self.server.scene.set_background_image(pixels, format=kind, jpeg_quality=JPEG_QUALITY)
+        self.server.scene.set_background_image(pixels, "png" if lossless else "jpeg", jpeg_quality=JPEG_QUALITY)
 
 
 def _own_name(asked: str, host: str) -> bool:
@@ -218,7 +217,7 @@ def _guarded(host: str) -> Iterator[None]:
             origins, hosts = (request.headers.get_all(name) for name in ("Origin", "Host"))
             own = len(hosts) == 1 and _own_name(hosts[0], host)
             if not own or any(urlsplit(origin).netloc != hosts[0] for origin in origins):
-                return connection.respond(403, "This page has another name.\n")
+                return connection.respond(403, "This page answers to localhost and its --host alone.\n")
             return process_request(connection, request)
 
         guarded.append(host)
