@@ -189,6 +189,8 @@ def test_a_summary_of_known_numbers():
     assert math.isnan(fast.ratio_to(30.5)), "the baseline never got there"
     (begun,) = summarise(study, [9.0])
     assert all(math.isnan(row.ratio_to(9.0)) for row in begun.rows)
+    lines = report_text(study, [summary]).splitlines()
+    assert [line.startswith("| base |") for line in lines if "+" in line] == [False, False], "not with itself"
     (default,) = summarise(study)
     assert default.targets == [29.0, 29.5, 30.0]
 
