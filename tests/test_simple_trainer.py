@@ -107,7 +107,7 @@ def test_how_much_sooner_the_whole_step_passes_stock(script):
     ours = run("step", (100, 1.0, 31.5, 0.80), (200, 2.0, 31.0, 0.90), (300, 3.0, 32.0, 0.91))
     stock = run("stock", (7000, 50.0, 31.0, 0.89), (9000, 60.0, 33.0, 0.9))
     lines = script("compare").sooner([stock, ours, {"error": 1}])
-    assert "7000 steps (50.0 s, 31.00 dB, 0.8900): passed after 2.00 s" in lines[0] and "25.0 times sooner" in lines[0]
+    assert "7000 steps (50.0 s, 31.00 dB, 0.8900), 42: passed after 2.00 s" in lines[0] and "25.0 times" in lines[0]
     assert "9000 steps" in lines[1] and lines[1].endswith("not passed")
 
 

@@ -116,7 +116,7 @@ def dropin() -> str:
         lines = []
         for run in record["runs"]:
             end, beside = run["marks"][-1], ""
-            if run["variant"] != "stock":
+            if run["variant"] != "stock" and run["scene"] in stock:
                 seconds = min(end["seconds"], stock[run["scene"]][-1]["seconds"])
                 ours, theirs = (psnr_at(marks, seconds) for marks in (run["marks"], stock[run["scene"]]))
                 beside = f"{ours - theirs:+.2f} dB: {ours:.2f} for {theirs:.2f} at {seconds:.0f} s"

@@ -13,6 +13,7 @@ already is not done again. For gsplat's own speed, fused-ssim must be installed;
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -194,20 +195,20 @@ def compare(options: Options) -> list[dict[str, Any]]:
 
 
 def sooner(runs: Iterable[dict[str, Any]]) -> list[str]:
-    """How much sooner the whole step passes PSNR and SSIM of each mark of stock, of a scene and a seed."""
-    found = {(run["scene"], run["seed"], run["variant"]): run["marks"] for run in runs if "marks" in run}
+    """How much sooner each whole step passes PSNR and SSIM of each mark of stock, of a scene, whatever the seeds."""
+    trained = [run for run in runs if "marks" in run]
+    stock, steps = ([run for run in trained if run["variant"] == name] for name in ("stock", "step"))
     lines = []
-    for (scene, seed, variant), marks in sorted(found.items()):
-        for mark in marks if variant == "stock" else ():
+    for run, ours in itertools.product(stock, steps):
+        for mark in run["marks"] if run["scene"] == ours["scene"] else ():
             had = f"{mark['seconds']:.1f} s, {mark['psnr']:.2f} dB, {mark['ssim']:.4f}"
-            ours = found.get((scene, seed, "step"), [])
-            past = [each for each in ours if each["psnr"] >= mark["psnr"] and each["ssim"] >= mark["ssim"]]
+            past = [each for each in ours["marks"] if each["psnr"] >= mark["psnr"] and each["ssim"] >= mark["ssim"]]
             said = "not passed"
             if past:
                 first = past[0]
                 said = f"passed after {first['seconds']:.2f} s ({first['psnr']:.2f} dB, {first['ssim']:.4f}): "
                 said += f"{mark['seconds'] / first['seconds']:.1f} times sooner"
-            lines.append(f"{scene} {seed}, stock's {mark['step']} steps ({had}): {said}")
+            lines.append(f"{run['scene']}, stock {run['seed']}'s {mark['step']} steps ({had}), {ours['seed']}: {said}")
     return lines
 
 
