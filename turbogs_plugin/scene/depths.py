@@ -47,21 +47,13 @@ class InverseDepths:
         shapes = -(-views.cameras.sizes // CELL)  # [V, 2]
         starts = pixel_offsets(shapes)
         cells = np.zeros(starts[-1], dtype=np.float32)
-        shown = views.observations
-        if shown is not None and len(shown):
-            viewmats, Ks = (getattr(views.cameras, name).cpu().double().numpy() for name in ("viewmats", "Ks"))
-            viewmats, Ks, shape = viewmats[shown.view_ids], Ks[shown.view_ids], shapes[shown.view_ids]  # [O, ...]
-            places = points.cpu().double().numpy()[shown.point_ids]
-            with np.errstate(all="ignore"):  # points may lie in a camera
-                places = np.einsum("oij,oj->oi", viewmats[:, :3, :3], places) + viewmats[:, :3, 3]
-                inverse = 1.0 / places[:, 2]
-                away = np.einsum("oij,oj->oi", Ks[:, :2], places * inverse[:, None]) - shown.pixels
-            at = np.floor(shown.pixels / CELL).astype(np.int64)  # [O, 2]
-            told = (inverse > 0) & (np.abs(away) <= FARTHEST_MATCH).all(axis=1) & ((at >= 0) & (at < shape)).all(axis=1)
-            flat = starts[shown.view_ids] + at[:, 1] * shape[:, 0] + at[:, 0]
-            np.maximum.at(cells, flat[told], inverse[told].astype(np.float32))
+        shown, places = views.observations, points.cpu().double().numpy()
+        viewmats, Ks = (getattr(views.cameras, name).cpu().double().numpy() for name in ("viewmats", "Ks"))
         for view, (width, height) in enumerate(shapes):
             own = cells[starts[view] : starts[view + 1]].reshape(height, width)
+            if shown is not None:
+                rows = slice(*np.searchsorted(shown.view_ids, (view, view + 1)))
+                _tell(own, viewmats[view], Ks[view], places[shown.point_ids[rows]], shown.pixels[rows])
             if maps is not None and (given := maps(view, own)) is not None:
                 np.copyto(own, given, where=own == 0, casting="same_kind")
         share = np.count_nonzero(cells) * CELL**2 / views.cameras.sizes.prod(axis=1).sum()
@@ -81,6 +73,18 @@ class InverseDepths:
         widths = torch.as_tensor(-(-samples.sizes[:, 0] // CELL), device=self.cells.device)
         x, y = (samples.coordinates() // CELL).unbind(dim=1)
         return self.cells[self.starts[views][slots] + y * widths[slots] + x]
+
+
+def _tell(cells: np.ndarray, viewmat: np.ndarray, K: np.ndarray, points: np.ndarray, pixels: np.ndarray) -> None:
+    """Set the inverse depths of a view's cells [h, w] where it shows these points [O, 3], at these pixels [O, 2]."""
+    points = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    with np.errstate(all="ignore"):  # points may lie in a camera
+        inverse = 1.0 / points[:, 2]
+        away = np.abs((points * inverse[:, None]) @ K[:2].T - pixels)
+    x, y = np.floor(pixels / CELL).astype(np.int64).T
+    told = (x >= 0) & (y >= 0) & (x < cells.shape[1]) & (y < cells.shape[0])
+    told &= (inverse > 0) & (away <= FARTHEST_MATCH).all(axis=1)
+    np.maximum.at(cells, (y[told], x[told]), inverse[told].astype(np.float32))
 
 
 @dataclass(frozen=True)
