@@ -133,7 +133,7 @@ def _require_plain(pickled: bytes) -> None:
 
 
 def save_gsplat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, antialiased: bool = False) -> None:
-    """Write a model (`formats.Format`) as gsplat's trainer does."""
+    """Write a model (`formats.Write`) as gsplat's trainer does."""
     save_plain(path, {"step": step, "splats": dict(in_capture(gaussians, frame, path).items())})
 
 
