@@ -79,7 +79,7 @@ def test_photos_stay_in_host_memory_when_a_run_is_looked_at(capture, tmp_path, m
     table = evaluate_run(tmp_path / "run", "cpu")
     assert f"{outcome.history[-1].psnr:.4f}" in table
     assert moved == ([] if place == "host" else [CPU])
-    render_run(tmp_path / "run", "train", "cpu")
+    render_run(tmp_path / "run", "train", "cpu", False)
     assert len(moved) == (place == "device")
 
 

@@ -25,7 +25,6 @@ from turbogs_plugin.model.placement import TRANSFORMS, gsplat_worlds, nearest_ch
 from turbogs_plugin.model.similarity import Similarity, local_origin, placed
 from turbogs_plugin.model.torch_file import read_gsplat, read_plain
 from turbogs_plugin.scene import Frame, PosedImages, Scene
-from turbogs_plugin.scene.fingerprint import frame_of_state
 from turbogs_plugin.train.checkpoint import COUNT_LIMIT, latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.train.look import Background, Look
@@ -93,7 +92,7 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         iteration = operator.index(trained["iteration"])
         if not 0 <= iteration < COUNT_LIMIT:
             raise ValueError("its iteration is none")
-        return SavedModel(folder, config, gaussians, frame_of_state(state), iteration, exposures)
+        return SavedModel(folder, config, gaussians, Frame(**state["frame"]), iteration, exposures)
     except (KeyError, TypeError, AttributeError, IndexError, ValueError, RuntimeError) as error:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
 
@@ -200,7 +199,7 @@ def read_given(path: str | Path) -> tuple[Gaussians, bool, Similarity | None]:
         return Gaussians(**whole), False, None
     try:
         gaussians = read_gsplat({"splats": state["trainer"]["gaussians"]}, file)
-        return gaussians, False, Similarity.into(frame_of_state(state)).inverse()
+        return gaussians, False, Similarity.into(Frame(**state["frame"])).inverse()
     except (KeyError, TypeError):
         keys = ", ".join(sorted(map(str, state))[:6]) if isinstance(state, Mapping) else type(state).__name__
         raise InputError(
