@@ -15,7 +15,7 @@ from turbogs_plugin.report.evaluation import LPIPS_PACKAGES
 from turbogs_plugin.report.provenance import hardware, missing_bytecode, software
 from turbogs_plugin.viewer.server import INSTALL as INSTALL_VIEWER
 
-REQUIREMENTS = "pycolmap>=4.0 filelock>=3.12 scipy>=1.10 trimesh>=4.0 tyro>=1.0.17,<1.1 rich>=13.0 matplotlib>=3.8"
+REQUIREMENTS = "pycolmap>=4.0 filelock>=3.12 scipy>=1.10 trimesh>=4.0 tyro>=1.0.17,<1.1 matplotlib>=3.8"
 """The extra ``train`` of pyproject.toml. The strategies and the gsplat bridge need none of it."""
 COMMAND_PACKAGES = {requirement.partition(">=")[0]: requirement for requirement in REQUIREMENTS.split()}
 """Module -> requirement."""

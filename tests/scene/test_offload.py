@@ -81,7 +81,7 @@ def test_photos_stay_in_host_memory_when_a_run_is_looked_at(capture, tmp_path, m
     measured = json.loads((tmp_path / "run/metrics.json").read_text())
     assert measured["mean"]["psnr"] == outcome.history[-1].psnr and len(measured["views"]) == 1
     assert moved == ([] if place == "host" else [CPU])
-    render_run(tmp_path / "run", "train", "cpu")
+    render_run(tmp_path / "run", "train", "cpu", False)
     assert len(moved) == (place == "device")
 
 

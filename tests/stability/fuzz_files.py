@@ -66,7 +66,7 @@ def kinds(folder: Path) -> dict[str, tuple[Path, Callable[[], object], list[Chan
     place = run.train(tiny_config(capture, "train.iterations=2"), folder / "run").folder
     models = {kind: folder / f"model.{kind}" for kind in FORMATS}
     for kind, file in models.items():
-        FORMATS[kind].write(random_gaussians(200, sh_degree=1), file, Frame(torch.zeros(3).numpy(), 1.0), 0, False)
+        FORMATS[kind][0](random_gaussians(200, sh_degree=1), file, Frame(torch.zeros(3).numpy(), 1.0), 0, False)
     frames = [
         {"file_path": f"images/{file.name}", "transform_matrix": torch.eye(4).tolist()}
         for file in sorted((capture / "images").iterdir())

@@ -104,7 +104,7 @@ def test_a_saved_run_is_shown_as_its_trainer_is(capture, scene, tmp_path):
         assert metrics.psnr != metrics.own_psnr and re.search(rf"^{row} +{value:.2f} ", table, re.MULTILINE), table
     of_training = replace(look, exposures=trainer.exposures.offsets)
     for split, views, shown in (("test", scene.test, look), ("train", scene.train, of_training)):
-        (folder,) = render_run(run, split, "cpu")
+        (folder,) = render_run(run, split, "cpu", False)
         picture = np.asarray(Image.open(sorted(folder.iterdir())[0]), dtype=np.float32) / 255
         wanted = render_view(trainer.gaussians, views, 0, shown)
         assert np.abs(picture - wanted.numpy()).max() <= 1 / 255

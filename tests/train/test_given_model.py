@@ -54,7 +54,7 @@ def trained(finished) -> Gaussians:
 @pytest.fixture
 def model(finished) -> Gaussians:
     """As it was written, in the capture's coordinates."""
-    return read_ply(finished / "model.ply")
+    return read_ply(finished / "model.ply")[0]
 
 
 def save_splats(path: Path, gaussians: Gaussians, **others) -> Path:
@@ -103,7 +103,7 @@ def test_a_given_model_has_the_tables_and_pictures_of_its_run(turbogs, finished,
 @pytest.mark.parametrize("world", range(4))
 def test_a_model_of_gsplats_normalised_world_is_brought_back(trained, model, scene, capture, tmp_path, world):
     """Whichever half turn gsplat's version and linear algebra made of it."""
-    loaded = load_given(save_splats(tmp_path / "ckpt.pt", worlds_of(capture)[world].apply(model)), scene, "gsplat")
+    loaded = load_given(save_splats(tmp_path / "ckpt.pt", worlds_of(capture)[world].apply(model)), scene, "gsplat")[0]
     for name in ("means", "scales", "opacities", "sh0", "shN"):
         torch.testing.assert_close(getattr(loaded, name), getattr(trained, name), rtol=1e-3, atol=1e-3)
     aligned = torch.nn.functional.cosine_similarity(loaded.quats, trained.quats).abs()
@@ -120,7 +120,7 @@ def test_the_world_is_said_by_a_setting_in_training_and_evaluation(turbogs, fini
     measured, expected = (float(re.search(r"mean of 1\W+([\d.]+)", text)[1]) for text in told)
     assert measured == pytest.approx(expected, abs=0.2)
     checkpoint = latest_checkpoint(finished / "checkpoints")  # knows its frame
-    assert_alike(load_given(checkpoint, scene, "gsplat"), trained)
+    assert_alike(load_given(checkpoint, scene, "gsplat")[0], trained)
 
 
 @pytest.mark.parametrize("turn", TURNS)
@@ -131,7 +131,7 @@ def test_nerfstudios_file_beside_a_model_brings_it_back(trained, model, scene, t
     (tmp_path / TRANSFORMS).write_text(json.dumps(values))
     theirs = Similarity(turn, 1.0, np.zeros(3)).inverse()
     for given in (change.after(theirs).apply(model), model):
-        loaded = load_given(save_splats(tmp_path / "a.pt", given), scene)
+        loaded = load_given(save_splats(tmp_path / "a.pt", given), scene)[0]
         torch.testing.assert_close(loaded.means, trained.means, rtol=1e-3, atol=1e-3)
     (tmp_path / TRANSFORMS).write_text(json.dumps(values | {"scale": 0}))
     with pytest.raises(InputError, match=TRANSFORMS):
@@ -150,7 +150,7 @@ def test_the_spz_of_splat_transform_is_turned_back(trained, model, scene, tmp_pa
     turned = Similarity(np.diag([-1.0, 1.0, -1.0]), 1.0, np.zeros(3)).apply(model)
     for given in (turned, model):
         save_spz(given.map(torch.Tensor.float), tmp_path / "a.spz", Frame(np.zeros(3), 1.0))
-        assert (load_given(tmp_path / "a.spz", scene).means - trained.means).abs().max() < 1e-3
+        assert (load_given(tmp_path / "a.spz", scene)[0].means - trained.means).abs().max() < 1e-3
 
 
 def test_a_model_of_antialiased_training_is_drawn_as_it_was_trained(trained, scene, capture, tmp_path):
@@ -176,7 +176,7 @@ def test_the_newest_model_in_folders_of_other_trainers(model, scene, tmp_path):
             part = model.map(lambda value, count=count: value[:count].float())
             save_splats(file, part) if file.suffix == ".pt" else save_ply(part, file)
         found = tmp_path / folder.partition("/")[0]
-        assert len(load_given(found, scene)) == 9
+        assert len(load_given(found, scene)[0]) == 9
         assert open_state(found, CPU).gaussians.means.shape[0] == 9
 
 
@@ -186,7 +186,7 @@ def test_rows_that_are_not_finite_are_left_out_and_counted_once(trained, model, 
     model.means[2, 1], model.opacities[5], model.shN[9, 0, 0] = torch.nan, torch.nan, -torch.inf
     file = save_splats(tmp_path / "ckpt.pt", model)
     with pytest.warns(UserWarning) as warned:
-        loaded = load_given(file, scene)
+        loaded = load_given(file, scene)[0]
     assert [str(w.message) for w in warned] == [f"{file}: 3 of {len(model)} Gaussians are not finite and left out"]
     assert_alike(loaded, trained.map(lambda value: value[kept]))
 
@@ -196,7 +196,7 @@ def test_ranks_of_one_model_are_put_together(trained, model, scene, tmp_path):
     first = save_splats(tmp_path / "ckpt_6999_rank0.pt", model.map(lambda value: value[:half]))
     save_splats(tmp_path / "ckpt_6999_rank1.pt", model.map(lambda value: value[half:]))
     save_splats(tmp_path / "ckpt_29999_rank1.pt", model)
-    assert_alike(load_given(first, scene), trained)
+    assert_alike(load_given(first, scene)[0], trained)
 
 
 def test_training_starts_from_a_model_where_that_had_ended_and_goes_on_without_it(finished, capture, tmp_path):

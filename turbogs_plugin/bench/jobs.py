@@ -38,7 +38,7 @@ def time_engine(
     of these numbers of views."""
     capture = load_scene(scene, load_config("turbogs", overrides).scene.factor)
     capture = replace(capture, train=capture.train.to(device))
-    loaded = load_given(ply, capture).map(lambda value: value.to(device))
+    loaded = load_given(ply, capture)[0].map(lambda value: value.to(device))
     models = (resized(loaded, size) for size in sizes)
     if what == "step":
         return {"model": ply.name, **bench_step(capture, models, views, repeats, overrides)}

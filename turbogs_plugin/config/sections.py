@@ -23,8 +23,6 @@ LONGEST_TIME = 100 * 3600.0
 AUTO_SETTINGS = ("backdrop", "background", "exposure", "dropout", "batch_for", "iterations", "pixels_place")
 """Settings of the section `train` that may be ``auto``; what a plan makes of it: `turbogs_plugin.plan.decisions`.
 `device` is not among them, as a plan is made for a given device."""
-STRIPS = 8
-"""Test views that a report, and TensorBoard, show as pictures, at most."""
 WRITTEN_FOR = 5000
 """Iterations for which the settings that count iterations are written where `train.iterations` is ``auto``."""
 
@@ -186,8 +184,8 @@ class MapsConfig:
 
 @dataclass
 class ReportConfig:
-    """The report. `tensorboard`: also write history and pictures of test views for TensorBoard, into the run's folder
-    at each evaluation; needs the extra ``tensorboard``."""
+    """The report. `tensorboard`: also write the history for TensorBoard, into the run's folder at each
+    evaluation; needs the extra ``tensorboard``."""
 
     tensorboard: bool = False
 

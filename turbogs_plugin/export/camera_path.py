@@ -15,7 +15,7 @@ from turbogs_plugin.captures.undistort import LARGEST_SIDE
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.placement import out_of_nerfstudio
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.geometry import camera_centers, evenly, look_at
+from turbogs_plugin.scene.geometry import camera_centers, evenly, look_at, seen
 from turbogs_plugin.types import Cameras
 from turbogs_plugin.yaml_json import parse_json
 
@@ -92,7 +92,7 @@ def from_file(path: Path, scene: Scene, frames: int) -> Cameras:
     if changes:
         points = scene.frame.restore_points(scene.points[evenly(len(scene.points), 1000)].cpu().numpy())
         moved, some = [change.apply_to_poses(viewmats) for change in changes], evenly(len(viewmats), MOST_KEYS)
-        viewmats = max(moved, key=lambda each: _seen(each[some], Ks[some], points))
+        viewmats = max(moved, key=lambda each: sum(len(seen(points, each[i], Ks[i], sizes[0])[0]) for i in some))
     return interpolated(scene.frame.normalise_poses(viewmats), Ks, sizes[0], frames)
 
 
@@ -106,13 +106,6 @@ def _camera(values: dict[str, Any], path: Path, place: int) -> tuple[np.ndarray,
     if K is None or K[0, 0] <= 0:
         raise InputError(f"{owner} has neither fl_x nor a camera_angle_x in 0 .. pi")
     return opengl_viewmat(values.get("transform_matrix"), f"{path}: the pose of camera {place}"), K, np.array(size)
-
-
-def _seen(viewmats: np.ndarray, Ks: np.ndarray, points: np.ndarray) -> int:
-    """How often C cameras, with the principal point in the middle, see one of the points [M, 3]."""
-    places = np.einsum("cij,mj->cmi", viewmats[:, :3, :3], points) + viewmats[:, None, :3, 3]  # [C, M, 3]
-    pixels = np.einsum("cij,cmj->cmi", Ks, places / np.maximum(places[:, :, 2:], 1e-9))[:, :, :2]
-    return int(((places[:, :, 2] > 0) & (abs(pixels - Ks[:, None, :2, 2]) < Ks[:, None, :2, 2]).all(axis=2)).sum())
 
 
 def _of_nerfstudio(content: dict[str, Any], path: Path) -> list[dict[str, Any]]:

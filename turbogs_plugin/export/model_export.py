@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,28 +32,17 @@ from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.saved_model import load_with_capture
 from turbogs_plugin.types import Cameras, Gaussians
 
-
-class Export(NamedTuple):
-    """A format of exported files: its suffix, how it is written and read again, None where every number is as it was;
-    and whether the file can say that the model is antialiased."""
-
-    suffix: str
-    write: Write
-    read: Read | None = None
-    marked: bool = False
-
-
 PAGE = "html"
 """Name of the page with the model to turn, which is made of more than a model and read by no program."""
-EXPORTS = {
-    **{name: Export(name, each.write, each.read, name != "pt") for name, each in FORMATS.items()},
-    "spz2": Export("spz", partial(save_spz, version=2), read_spz, True),
-    "splat": Export("splat", save_splat, read_splat),
-    "glb": Export("glb", save_glb),
-    "usda": Export("usda", save_usda),
-    PAGE: Export(PAGE, lambda *_: None),
+EXPORTS: dict[str, tuple[Write, Read | None]] = {
+    **FORMATS,
+    "spz2": (partial(save_spz, version=2), read_spz),
+    "splat": (save_splat, read_splat),
+    "glb": (save_glb, None),
+    "usda": (save_usda, None),
 }
-"""Name, as on the command line -> the format."""
+"""Name, as on the command line, whose letters are the file's suffix -> how a file is written and read again, None where
+every number is as it was."""
 MOST_ON_PAGE = 800_000
 """Largest model of a page: 36 bytes a Gaussian make about 30 MB, which mail and chat programs take."""
 MOST_VIEWS = 8
@@ -68,7 +56,7 @@ def export_run(
 
     Args:
         path: folder of the run, or the file of a model.
-        file_format: one of `EXPORTS`.
+        file_format: one of `EXPORTS`, or `PAGE`.
         out: new file; None: in the run's folder, where ``model.ply`` is the training's own.
         max_gaussians: largest number of Gaussians to keep, those that add most to the training views; None: all.
         given: the capture of a model from a file, and how to render it; None: `path` is a run.
@@ -79,37 +67,37 @@ def export_run(
     Raises:
         InputError: an option does not fit, no such model, or no usable capture where it is needed.
     """
-    form = _required_format(path, file_format, out, max_gaussians, given)
-    is_page = file_format == PAGE
-    needed = max_gaussians is not None or is_page
-    model, scene, absent = load_with_capture(path, given, resolve_device("auto"), needed)
-    file = out or path / ("export.ply" if file_format == "ply" else f"model.{form.suffix}")
+    file, is_page = _required_file(path, file_format, out, max_gaussians, given), file_format == PAGE
     most = min(max_gaussians or MOST_ON_PAGE, MOST_ON_PAGE) if is_page else max_gaussians
-    kept, whole, frame, notes = model.gaussians, model.gaussians, model.frame, []
+    model, scene, absent = load_with_capture(path, given, resolve_device("auto"), needed=most is not None)
+    kept, whole, frame, antialiased, notes = model.gaussians, model.gaussians, model.frame, False, []
     if scene is not None and most is not None and most < len(whole):
         kept = pruned(whole, contributions(whole, scene.train.cameras, model.config.raster), most)
         notes.append(f"the {len(kept)} of {len(whole)} Gaussians that add most to the training views")
-    if unmarked := model.antialiased and not form.marked:
-        notes.append("of antialiased training, which this file does not say: viewers draw it thicker")
     if is_page and scene is not None:
         written = page_gaussians(kept, scene.train.cameras, model.sh_degree)
     else:
         if (origin := local_origin(frame)).any():
             frame = Frame(frame.center - origin, frame.scale)
             notes.append(f"about the local origin {' '.join(f'{value:.12g}' for value in origin)}")
-        if form.suffix == "spz":
+        if file_format.startswith("spz"):
             notes.append(
-                f"version {VERSION}; older viewers need --format spz2" if file_format == "spz" else "version 2"
+                "version 2" if file_format == "spz2" else f"version {VERSION}; older viewers need --format spz2"
             )
-        form.write(kept, file, frame, model.iteration or 0, model.antialiased)
-        written = kept if form.read is None else Similarity.into(frame).apply(form.read(file)).map(torch.Tensor.float)
+        write, read = EXPORTS[file_format]
+        write(kept, file, frame, model.iteration or 0, model.antialiased)
+        written = kept
+        if read is not None:
+            found, antialiased = read(file)
+            written = Similarity.into(frame).apply(found).map(torch.Tensor.float)
+    if model.antialiased and not antialiased:
+        notes.append("of antialiased training, which this file does not say: viewers draw it thicker")
     lost = f"not measured: {absent or 'the capture has no test views'}"
     caption = f"{len(written):,} Gaussians, one colour each"
     if scene is not None and len(scene.test):
         test, chosen = place_views(scene.test, whole.device, "host"), evenly(len(scene.test), MOST_VIEWS)
         look = model.own_look(test)
-        degree, antialiased = min(look.sh_degree, written.sh_degree), look.antialiased and not unmarked
-        other = replace(look, sh_degree=degree, antialiased=antialiased)
+        other = replace(look, sh_degree=min(look.sh_degree, written.sh_degree), antialiased=antialiased)
         shown = ((whole, look), (written.map(lambda value: value.to(whole.device)), other))
         before, after = (evaluate(each, test, seen, view_ids=chosen).mean.psnr for each, seen in shown)
         lost = f"{before:.3f} -> {after:.3f} dB on {len(chosen)} of {len(test)} test views"
@@ -123,21 +111,22 @@ def export_run(
     return f"{file}{said}\nsize   {size}, {len(written)} of {len(whole)} Gaussians\nPSNR   {lost}"
 
 
-def _required_format(
+def _required_file(
     path: Path, file_format: str, out: Path | None, max_gaussians: int | None, given: Config | None
-) -> Export:
-    """The format. Raises `InputError` where options do not fit each other, before anything is loaded."""
-    if file_format not in EXPORTS:
-        raise InputError(f"--format {file_format}: there is no such format; choose one of {', '.join(EXPORTS)}")
+) -> Path:
+    """The new file. Raises `InputError` where options do not fit each other, before anything is loaded."""
+    if file_format not in (names := (*EXPORTS, PAGE)):
+        raise InputError(f"--format {file_format}: there is no such format; choose one of {', '.join(names)}")
     if max_gaussians is not None and max_gaussians < 1:
         raise InputError(f"--max-gaussians {max_gaussians}: it must be at least 1")
+    suffix = file_format.rstrip("2")
     if out is not None:
         require_new_file(out, "--out")
-        if out.suffix.lower() != (suffix := f".{EXPORTS[file_format].suffix}"):
-            raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in {suffix}")
+        if out.suffix.lower() != f".{suffix}":
+            raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in .{suffix}")
     elif given is not None:
         raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
-    return EXPORTS[file_format]
+    return out or path / ("export.ply" if suffix == "ply" else f"model.{suffix}")
 
 
 @torch.no_grad()

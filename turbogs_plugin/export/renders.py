@@ -33,28 +33,21 @@ INSTALL = 'pip install "imageio-ffmpeg>=0.5"'
 
 
 def render_run(
-    path: Path,
-    split: str,
-    device_name: str,
-    with_depth: bool = False,
-    given: Config | None = None,
-    out: Path | None = None,
+    path: Path, split: str, device_name: str, with_depth: bool, given: Config | None = None, out: Path | None = None
 ) -> list[Path]:
-    """Write the views of a split, rendered from a run's newest model or a given one, as PNGs, and say what was done
-    with the capture's photos: where they were undistorted, the cameras are, too.
+    """Write the views of a split, rendered from the model of `open_saved`, as PNGs, and say what was done with the
+    capture's photos: where they were undistorted, the cameras are, too.
 
     Args:
-        path: folder of the run, or the file of a model.
         with_depth: also write each view's expected depth along the camera's axis, in the capture's own units, 0 where
             nothing was hit: as ``.npy`` ([H, W] float32) and as a coloured PNG (`depth_picture`).
-        given: the capture of a model from a file, and how to render it; None: `path` is a run.
         out: folder for the folder of the views; None: ``renders`` of the run.
 
     Returns:
         The folder of the views, and with depth the folder of the depths.
 
     Raises:
-        InputError: no such model, no usable capture, or no folder to write to.
+        InputError: as of `open_saved`, or there is no folder to write to.
     """
     if out is not None:
         require_writable(out, f"--out '{out}'")
@@ -90,8 +83,8 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
 def film_run(
     path: Path, camera_path: str, video: Path, seconds: float, device_name: str, given: Config | None = None
 ) -> Path:
-    """Write a film of a run's newest model or of a given one into a new file, along orbit, views, or a file of cameras.
-    Arguments and errors as of `render_run`; `InputError`, too, where an option does not fit."""
+    """Write a film of the model of `open_saved` into a new file, along orbit, views, or a file of cameras. Errors as of
+    `open_saved`; `InputError`, too, where an option does not fit."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise InputError(f"a film needs imageio-ffmpeg: {INSTALL}")
     if not 0 < seconds <= 3600:
@@ -121,19 +114,16 @@ def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) 
         InputError: the encoder refused.
     """
     import imageio_ffmpeg
-    from rich.console import Console
-    from rich.progress import track
 
     width, height = (cameras.sizes[0] // 2 * 2).tolist()
     cameras = cameras.to(gaussians.device)
     options = {"fps": RATE, "codec": CODEC, "quality": QUALITY, "macro_block_size": 1, "ffmpeg_log_level": "error"}
-    frames = track(range(len(cameras)), "frames", console=Console(stderr=True), disable=not sys.stderr.isatty())
     with tempfile.TemporaryDirectory(dir=video.parent, prefix=".") as hidden:
         temporary = Path(hidden) / video.name  # ffmpeg knows the container by the suffix
         try:
             with closing(imageio_ffmpeg.write_frames(str(temporary), (width, height), **options)) as writer:
                 writer.send(None)
-                for frame in frames:
+                for frame in range(len(cameras)):
                     image = render_image(gaussians, cameras, frame, **look.options)
                     writer.send(np.ascontiguousarray(to_uint8(image.colors)[:height, :width]))
             temporary.replace(video)

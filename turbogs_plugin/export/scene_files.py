@@ -128,15 +128,13 @@ def save_splat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, an
     write_atomically(path, lambda file: file.write(table[order.numpy()].tobytes()))
 
 
-def read_splat(path: Path) -> Gaussians:
-    """What `save_splat` wrote; float64, on the CPU."""
+def read_splat(path: Path) -> tuple[Gaussians, bool]:
+    """What `save_splat` wrote (`formats.Read`), on the CPU."""
     table = np.fromfile(path, SPLAT)
     means, scales, colors, quats = (torch.from_numpy(table[name].astype(np.float64)) for name in SPLAT.names or ())
-    sh0, opacities = (
-        (colors[:, None, :3] / 255.0 - 0.5) / SH_C0,
-        torch.logit((colors[:, 3] / 255.0).clamp(1e-4, 0.9999)),
-    )
-    return Gaussians(means, quats - 128.0, scales.log(), opacities, sh0, torch.zeros(len(means), 0, 3).double())
+    sh0 = (colors[:, None, :3] / 255.0 - 0.5) / SH_C0
+    opacities = torch.logit((colors[:, 3] / 255.0).clamp(1e-4, 0.9999))
+    return Gaussians(means, quats - 128.0, scales.log(), opacities, sh0, means.new_zeros(len(means), 0, 3)), False
 
 
 def _bytes(values: Tensor) -> np.ndarray:

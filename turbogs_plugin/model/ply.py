@@ -11,7 +11,7 @@ import torch
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
-from turbogs_plugin.model.similarity import Similarity, in_capture, placed, rounding
+from turbogs_plugin.model.similarity import in_capture, rounding
 from turbogs_plugin.model.torch_file import BANDS
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.ply import read_vertices
@@ -19,21 +19,20 @@ from turbogs_plugin.types import Gaussians
 
 POSITION_ERROR = 1e-6
 """Largest `rounding` of positions that are written as float."""
+OWN = Frame(np.zeros(3), 1.0)
+"""The frame that is the capture's own coordinates."""
 HEADER_AT_MOST = 1 << 16
 """Bytes of a file in which a comment is looked for."""
 ANTIALIASED = re.compile(rb"^comment\s+(splatrendermode:\s*mip|antialiased\W+(1|true))\b", re.MULTILINE | re.IGNORECASE)
 """Brush's comment, which splat-transform writes, too, and Postshot's."""
 
 
-def save_ply(
-    gaussians: Gaussians, path: Path, frame: Frame | None = None, step: int = 0, antialiased: bool = False
-) -> None:
-    """Write a model (`formats.Format`), with normals of zero. A comment says in Brush's words how it is drawn.
+def save_ply(gaussians: Gaussians, path: Path, frame: Frame = OWN, step: int = 0, antialiased: bool = False) -> None:
+    """Write a model (`formats.Write`), with normals of zero. A comment says in Brush's words how it is drawn.
 
     All properties are float, as viewers expect. Only x, y and z are double, if the capture lies so far from the origin
     that float would round positions by more than `POSITION_ERROR` of its extent (UTM metres).
     """
-    frame = frame or Frame(np.zeros(3), 1.0)
     rows = in_capture(gaussians, frame, path, double_means=True)
     groups = _property_groups(rows.shN.shape[1])
     kinds = dict.fromkeys(groups, "float") | ({"means": "double"} if rounding(frame) > POSITION_ERROR else {})
@@ -54,11 +53,11 @@ def save_ply(
     write_atomically(path, write)
 
 
-def read_ply(path: Path) -> Gaussians:
-    """A model from a .ply with the properties of 3DGS, in the file's own coordinates; float64, on the CPU, perhaps with
-    rows that are not finite. Other properties are ignored but the ``filter_3D`` of Mip-Splatting, which is fused into
-    scales and opacities (Yu et al. 2024, equation 7). Raises `InputError` where the file is not such a .ply, lacks a
-    property, or has no Gaussian."""
+def read_ply(path: Path) -> tuple[Gaussians, bool]:
+    """A model (`formats.Read`) from a .ply with the properties of 3DGS, on the CPU, perhaps with rows that are not
+    finite; a comment may say that it is drawn with antialiasing. Other properties are ignored but the ``filter_3D`` of
+    Mip-Splatting, which is fused into scales and opacities (Yu et al. 2024, equation 7). Raises `InputError` where the
+    file is not such a .ply, lacks a property, or has no Gaussian."""
     vertices = read_vertices(path)
     rest = sum(name.startswith("f_rest_") for name in vertices)
     if rest not in [3 * each for each in BANDS]:
@@ -88,19 +87,10 @@ def read_ply(path: Path) -> Gaussians:
         wider = 0.5 * torch.logaddexp(2.0 * scales, 2.0 * sizes.log()[:, None])
         opacities = torch.logit(torch.sigmoid(opacities) * (scales - wider).sum(dim=1).exp())
         scales = wider
-    return Gaussians(means, quats, scales, opacities, sh0[:, None], shN.reshape(count, 3, rest // 3).mT)
-
-
-def load_ply(path: Path, frame: Frame | None = None) -> Gaussians:
-    """The model of `read_ply` as training and rendering take it (`placed`), in a frame of the file's coordinates."""
-    return placed(read_ply(path), Similarity.into(frame or Frame(np.zeros(3), 1.0)), path)
-
-
-def is_antialiased_ply(path: Path) -> bool:
-    """Whether a comment of the header says that the model is drawn with antialiasing. Raises `OSError`."""
     with path.open("rb") as file:
         header = file.read(HEADER_AT_MOST).replace(b"\r", b"\n").partition(b"\nend_header")[0]
-    return ANTIALIASED.search(header) is not None
+    model = Gaussians(means, quats, scales, opacities, sh0[:, None], shN.reshape(count, 3, rest // 3).mT)
+    return model, ANTIALIASED.search(header) is not None
 
 
 def _property_groups(bands: int) -> dict[str, list[str]]:

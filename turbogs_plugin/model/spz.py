@@ -15,7 +15,6 @@ import struct
 import warnings
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -49,7 +48,7 @@ READING = 2 * 8 * 59
 def save_spz(
     gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, antialiased: bool = False, version: int = VERSION
 ) -> None:
-    """Write a model (`formats.Format`) in version 2 or 3. `InputError` where positions are too large for it."""
+    """Write a model (`formats.Write`) in version 2 or 3. `InputError` where positions are too large for it."""
     values = {name: value.double().numpy() for name, value in upright(in_capture(gaussians, frame, path)).items()}
     largest = float(np.abs(values["means"]).max())
     bits = min(MOST_FRACTIONAL_BITS, 22 - max(0, math.ceil(math.log2(max(largest, 1e-9)))))
@@ -71,17 +70,11 @@ def save_spz(
     write_atomically(path, lambda file: file.write(content))
 
 
-def is_antialiased_spz(path: Path) -> bool:
-    """Whether a flag says that the model, which `read_spz` takes, is drawn with antialiasing. Raises `OSError`."""
-    with path.open("rb") as file:
-        return bool(_header(file.read(1 << 12))[1][5] & ANTIALIASED)
-
-
-def read_spz(path: Path) -> Gaussians:
-    """A model in x right, y down, z forward; float64, on the CPU. Raises `InputError` where the file is not a whole one
-    of this format, needs zstandard (version 4), or unpacks to more than `MOST_UNPACKED` times its bytes, or than the
-    memory takes."""
-    version, bits, (means, opacities, colors, scales, rotations, harmonics) = _unpacked(path)
+def read_spz(path: Path) -> tuple[Gaussians, bool]:
+    """A model (`formats.Read`) in x right, y down, z forward, on the CPU. Raises `InputError` where the file is not a
+    whole one of this format, needs zstandard (version 4), or unpacks to more than `MOST_UNPACKED` times its bytes, or
+    than the memory takes."""
+    version, bits, flags, (means, opacities, colors, scales, rotations, harmonics) = _unpacked(path)
     if version == 1:
         warnings.warn(f"{path} is of version 1, which has positions in half precision: export it again", stacklevel=2)
         places = means.view("<f2").astype(np.float64)
@@ -98,23 +91,19 @@ def read_spz(path: Path) -> Gaussians:
     shares = (opacities[:, 0] / 255.0).clip(1e-4, 1.0 - 1e-4)
     sh0, shN = (colors / 255.0 - 0.5) / COLOR_SCALE, (harmonics - 128.0) / SH_SCALE
     values = [places, quats[:, [3, 0, 1, 2]], scales / 16.0 - 10.0, np.log(shares / (1.0 - shares)), sh0[:, None]]
-    return upright(Gaussians(*map(torch.from_numpy, [*values, shN.reshape(len(means), -1, 3)])))
+    model = upright(Gaussians(*map(torch.from_numpy, [*values, shN.reshape(len(means), -1, 3)])))
+    return model, bool(flags & ANTIALIASED)
 
 
-def _header(content: bytes) -> tuple[Any, tuple[int, ...]]:
-    """What goes on to unpack a file, None for version 4, and the header; of a file's first bytes or all of them."""
-    if content.startswith(MAGIC.to_bytes(4, "little")):
-        return None, HEADER.unpack(content[: HEADER.size].ljust(HEADER.size, b"\0"))
-    unpacker = zlib.decompressobj(wbits=31)
-    return unpacker, HEADER.unpack(unpacker.decompress(content, HEADER.size).ljust(HEADER.size, b"\0"))
-
-
-def _unpacked(path: Path) -> tuple[int, int, list[np.ndarray]]:
-    """Version, fractional bits, and the bytes [N, ...] uint8 of the six arrays."""
+def _unpacked(path: Path) -> tuple[int, int, int, list[np.ndarray]]:
+    """Version, fractional bits, flags, and the bytes [N, ...] uint8 of the six arrays."""
     version = VERSION
     try:
         content = path.read_bytes()
-        unpacker, (magic, version, count, degree, bits, flags, streams) = _header(content)
+        # Version 4 has a plain header.
+        unpacker = None if content.startswith(MAGIC.to_bytes(4, "little")) else zlib.decompressobj(wbits=31)
+        head = unpacker.decompress(content, HEADER.size) if unpacker else content[: HEADER.size]
+        magic, version, count, degree, bits, flags, streams = HEADER.unpack(head.ljust(HEADER.size, b"\0"))
         if magic != MAGIC or version not in ((1, 2, 3) if unpacker else (4,)) or degree > 3 or not count:
             raise InputError(f"{path} is no .spz of version 1 .. 4 and degree 0 .. 3: convert what it was made of")
         widths = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1))
@@ -137,7 +126,7 @@ def _unpacked(path: Path) -> tuple[int, int, list[np.ndarray]]:
     if not whole:
         raise InputError(f"{announced} and lacks some of them: export it again")
     arrays = np.split(np.frombuffer(body, dtype=np.uint8, count=size), count * np.cumsum(widths[:-1]))
-    return version, bits, [array.reshape(count, width) for array, width in zip(arrays, widths, strict=True)]
+    return version, bits, flags, [array.reshape(count, width) for array, width in zip(arrays, widths, strict=True)]
 
 
 def _of_streams(content: bytes, streams: int, sizes: list[int]) -> bytes:

@@ -29,16 +29,10 @@ JPEG_QUALITY = 92
 
 
 def save_image(path: Path, pixels: np.ndarray) -> None:
-    """Write a picture, [H, W, 3] uint8; the file's suffix says in which format.
-
-    Raises:
-        OSError: it cannot be written; the error names the file.
-    """
+    """Write a picture, [H, W, 3] uint8, as its suffix says, .jpg or .png. Raises `OSError`, which names the file."""
+    kind = "JPEG" if path.suffix == ".jpg" else "PNG"  # which has no use for the options
     with naming(path), new_file(path) as file:
-        if path.suffix == ".jpg":
-            Image.fromarray(pixels).save(file, "JPEG", quality=JPEG_QUALITY, subsampling=0)
-        else:
-            Image.fromarray(pixels).save(file, "PNG")
+        Image.fromarray(pixels).save(file, kind, quality=JPEG_QUALITY, subsampling=0)
 
 
 def strip(photo: Tensor, image: Tensor, mask: Tensor | None = None) -> Tensor:

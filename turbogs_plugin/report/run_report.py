@@ -8,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from turbogs_plugin.config.sections import STRIPS
 from turbogs_plugin.files import read_text, write_text_atomically
 from turbogs_plugin.report.evaluation import load_lpips
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip
 from turbogs_plugin.report.provenance import hardware, software
 from turbogs_plugin.report.tables import ERRORS, error_columns, errors, escaped, table, views_table
 from turbogs_plugin.strategies.view_sampling import doubted
-from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.metrics import Metrics, evaluate, render_view
 from turbogs_plugin.train.session import RunSession
 
+STRIPS = 8
+"""Most test views, and most doubted photos, that the page shows."""
 DOUBTED = """
 The model does not explain these training photos as it does the others: look for a wrong pose, a passer-by, blur or
 another light. The view sampler `random` takes each in one of five rounds."""
@@ -58,19 +58,9 @@ def write_report(run: RunSession) -> Path:
     return run.folder.report
 
 
-def _mebibytes(evaluation: Evaluation) -> str:
-    return f"{evaluation.memory_bytes / 2**20:.0f}"
-
-
 def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int, doubts: dict[int, float]) -> str:
-    """The text of the page.
-
-    Args:
-        metrics: of the final model.
-        lpips_reason: why LPIPS was not computed; empty where it was.
-        shown: test views with a picture.
-        doubts: photo that training doubted -> times the median that its error is.
-    """
+    """The text of the page: errors of the final model, why LPIPS is not among them, the number of test views with a
+    picture, and photos that training doubted with times the median that their error is."""
     last, plan = run.history[-1], read_text(run.folder.plan) or "The run's folder holds no plan."
     config = run.trainer.config
     columns = error_columns(metrics)
@@ -93,12 +83,13 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int, doub
     grey = "; masked pixels of photo and error are grey" if masked else ""
     heads = (*columns.values(), "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB")
     wall = run.wall.wall_seconds
-    seconds = f"{last.train_seconds:.1f}", "not recorded" if wall is None else f"{wall:.1f}"
     rows = [
-        (str(of.iteration), f"{of.train_seconds:.1f}", *errors(of), str(of.num_gaussians), _mebibytes(of))
+        [f"{of.iteration}", f"{of.train_seconds:.1f}", *errors(of), f"{of.num_gaussians}", f"{of.memory_bytes >> 20}"]
         for of in run.history
     ]
-    cells = (*errors(metrics.mean, columns), *seconds, str(last.num_gaussians), f"{metrics.fps:.1f}", _mebibytes(last))
+    seconds, *_, count, memory = rows[-1][1:]
+    whole = "not recorded" if wall is None else f"{wall:.1f}"
+    cells = [*errors(metrics.mean, columns), seconds, whole, count, f"{metrics.fps:.1f}", memory]
     result = table(heads, [cells])
     lpips = f"\nLPIPS was not computed: {lpips_reason}.\n" if lpips_reason else ""
     history = table(("iteration", "training in s", *ERRORS.values(), "Gaussians", "peak memory in MiB"), rows)
@@ -113,7 +104,6 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int, doub
     )
     doubted_photos = doubted_photos and f"\n## Doubted photos\n{DOUBTED}\n{doubted_photos}"
     folder = shlex.quote(str(run.folder.path))
-    exported = "[model.html](model.html)" if (run.folder.path / "model.html").is_file() else "`model.html`"
     return f"""# {escaped(run.scene.name)}
 
 {last.iteration} iterations on {len(run.scene.train)} training views, seed {config.train.seed}; measured on
@@ -125,7 +115,8 @@ Means over the test views{unmasked}. Training time is that of iterations and of 
 evaluation, checkpoints and this report are not in it. Wall time is from the start of the command until the model was
 written. FPS counts test views rendered one after the other.{on}
 
-`turbogs export {folder} --format html` writes a page with the model to turn in a browser, {exported}.
+`turbogs export {folder} --format html` writes a page with the model to turn in a browser, `model.html`. The run's
+configuration is in [config.yaml](config.yaml).
 
 ## Error against run time
 
@@ -159,10 +150,4 @@ finite: {last.skipped_updates}.
 {hardware(config.train.device)}, {platform.system()} {platform.machine()}.
 
 {table(("software", "version"), software())}
-
-## Configuration
-
-```yaml
-{config.to_yaml().rstrip()}
-```
 """

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.geometry import evenly
+from turbogs_plugin.scene.geometry import evenly, seen
 from turbogs_plugin.scene.scene import PosedImages, Scene
 
 SHORTEST_LENS = 0.05
@@ -40,10 +40,7 @@ def unseeing_note(scene: Scene) -> str:
         viewmats, Ks = views.cameras.viewmats.cpu().numpy(), views.cameras.Ks.cpu().numpy()
         for name, viewmat, K, size in zip(views.names, viewmats, Ks, views.cameras.sizes, strict=True):
             for step in (max(1, len(points) // MOST_POINTS), 1):  # all of them where none of some is seen
-                places = points[::step] @ viewmat[:3, :3].T + viewmat[:3, 3]
-                with np.errstate(all="ignore"):
-                    pixels = (places @ K.T)[:, :2] / places[:, 2:]
-                if ((places[:, 2:] > 0) & (pixels >= 0) & (pixels < size)).all(axis=1).any():
+                if len(seen(points[::step], viewmat, K, size)[0]):
                     break
             else:
                 blind.append(name)
@@ -88,17 +85,13 @@ def likeness(scene: Scene, poses: np.ndarray) -> tuple[int, float]:
     own = scene.point_colors[rows].cpu().numpy().astype(np.float64)  # [M, 3]
     shown: list[np.ndarray] = []
     for view_id in evenly(len(views), MOST_PHOTOS):
-        width, height = views.cameras.sizes[view_id].tolist()
-        places = points @ poses[view_id, :3, :3].T + poses[view_id, :3, 3]
-        ids = np.flatnonzero(places[:, 2] > 0)
-        pixels = places[ids] @ views.cameras.Ks[view_id].double().cpu().numpy().T
-        pixels = pixels[:, :2] / pixels[:, 2:]
-        within = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
-        ids, columns, lines = ids[within], pixels[within, 0].astype(np.int64), pixels[within, 1].astype(np.int64)
+        size = views.cameras.sizes[view_id]
+        ids, pixels, depths = seen(points, poses[view_id], views.cameras.Ks[view_id].double().cpu().numpy(), size)
+        (columns, lines), width = pixels.astype(np.int64).T, size[0]
         cells = columns * CELLS // width + (CELLS + 1) * (lines * CELLS // width)
         nearest = np.full(cells.max(initial=0) + 1, np.inf)
-        np.minimum.at(nearest, cells, places[ids, 2])
-        visible = places[ids, 2] <= 1.05 * nearest[cells]
+        np.minimum.at(nearest, cells, depths)
+        visible = depths <= 1.05 * nearest[cells]
         photo = _pixels(views, view_id, 1)[(lines * width + columns)[visible], :3].astype(np.float64)
         pair = np.stack([own[ids[visible]], photo])  # [2, N, 3]
         shown.append(pair - pair.mean(axis=1, keepdims=True) if visible.any() else pair)

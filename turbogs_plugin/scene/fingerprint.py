@@ -23,11 +23,6 @@ def capture_state(scene: Scene) -> dict[str, Any]:
     }
 
 
-def frame_of_state(state: dict[str, Any]) -> Frame:
-    """The frame in a `capture_state`. Raises `InputError` where it is none."""
-    return Frame(np.array(state["frame"]["center"]), state["frame"]["scale"])
-
-
 def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
     """The difference of a capture from a saved one, in words; empty where there is none. Both are what `capture_state`
     gave, of one structure (`checkpoint.require_like`), among other things."""
@@ -38,10 +33,8 @@ def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
         bounds = {"sizes": 0.0, "unmasked": 0.0, "Ks": ROUNDING * now["Ks"].abs(), "viewmats": ROUNDING}
         for key, bound in bounds.items():
             if before[key].shape != now[key].shape or not ((before[key] - now[key]).abs() <= bound).all():
-                return (
-                    f"other {'masks' if key == 'unmasked' else key if key == 'sizes' else 'cameras'} of {split} images"
-                )
-    first, frame = frame_of_state(saved), frame_of_state(present)
+                return f"other {'masks' if key == 'unmasked' else 'cameras'} of {split} images"
+    first, frame = (Frame(**state["frame"]) for state in (saved, present))
     moved = max(np.abs(first.center - frame.center).max(), abs(first.scale - frame.scale))
     return "other coordinates" if moved > ROUNDING * frame.scale else ""
 

@@ -37,6 +37,20 @@ def viewmat_of_pose(axes: np.ndarray, center: np.ndarray) -> np.ndarray:
     return viewmat
 
 
+def seen(
+    points: np.ndarray, viewmat: np.ndarray, K: np.ndarray, size: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The points [M, 3] that a camera sees in its image of `size` (width, height): their rows [S], pixels [S, 2] and
+    depths [S]."""
+    places = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    rows = np.flatnonzero(places[:, 2] > 0)
+    pixels = places[rows] @ K.T
+    with np.errstate(all="ignore"):  # depths may be too small to divide by
+        pixels = pixels[:, :2] / pixels[:, 2:]
+    within = ((pixels >= 0) & (pixels < size)).all(axis=1)
+    return rows[within], pixels[within], places[rows[within], 2]
+
+
 def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """[4, 4] float64 world to camera of a camera at `center` [3] with `target` [3] in the middle of its image.
     `up` [3], which is not parallel to the view, points upwards there."""

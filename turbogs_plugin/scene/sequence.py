@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
+from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 
@@ -33,21 +33,16 @@ def neighbours(names: Iterable[str], known: Sequence[str], photos: Sequence[str]
 
     The photos of one folder are taken for one sequence: cameras, and programs that cut videos, number what they
     write."""
-    ordered = sorted(set(names), key=_key)
-    places = {name: place for place, name in enumerate(ordered)}
-    folders = np.unique([_folder(name) for name in ordered], return_inverse=True)[1]  # of each place
-    there, here = (np.array([places[name] for name in group], dtype=np.int64) for group in (known, photos))
-    order, here = there.argsort(), here[:, None]  # [known], [W, 1]
-    there = there[order]
-    before = np.searchsorted(there, here - 1, side="right") - 1
-    found = np.concatenate([before, np.searchsorted(there, here + 1)], axis=1)  # [W, 2]
-    inside: NDArray[np.bool_] = np.logical_and(found >= 0, found < len(there))
-    there, order, found[~inside] = np.append(there, 0), np.append(order, 0), -1  # -1: the one appended
-    inside &= folders[there[found]] == folders[here]
-    lengths = np.where(inside, np.abs(there[found] - here), 0)
-    both = np.asarray(inside.all(axis=1, keepdims=True))
-    weights = np.where(both, lengths[:, ::-1] / np.maximum(1, lengths.sum(axis=1, keepdims=True)), inside)
-    rows = np.where(inside, order[found], 0)
+    places = {name: place for place, name in enumerate(sorted(set(names), key=_key))}
+    there = sorted((places[name], row, _folder(name)) for row, name in enumerate(known))
+    rows, weights = np.zeros((len(photos), 2), dtype=np.int64), np.zeros((len(photos), 2))
+    for number, photo in enumerate(photos):
+        here = places[photo]
+        beside = bisect_left(there, (here,)) - 1, bisect_left(there, (here + 1,))
+        near = [there[at] if 0 <= at < len(there) and there[at][2] == _folder(photo) else None for at in beside]
+        lengths = [abs(each[0] - here) if each else 0 for each in near]
+        rows[number] = [each[1] if each else 0 for each in near]
+        weights[number] = [length / sum(lengths) for length in lengths[::-1]] if all(lengths) else np.sign(lengths)
     return Neighbours(torch.from_numpy(rows), torch.from_numpy(weights).float())
 
 

@@ -25,7 +25,6 @@ from turbogs_plugin.model.placement import TRANSFORMS, gsplat_worlds, nearest_ch
 from turbogs_plugin.model.similarity import Similarity, local_origin, placed
 from turbogs_plugin.model.torch_file import read_gsplat, read_plain
 from turbogs_plugin.scene import Frame, PosedImages, Scene
-from turbogs_plugin.scene.fingerprint import frame_of_state
 from turbogs_plugin.train.checkpoint import COUNT_LIMIT, latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.train.look import Background, Look
@@ -93,7 +92,7 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         iteration = operator.index(trained["iteration"])
         if not 0 <= iteration < COUNT_LIMIT:
             raise ValueError("its iteration is none")
-        return SavedModel(folder, config, gaussians, frame_of_state(state), iteration, exposures)
+        return SavedModel(folder, config, gaussians, Frame(**state["frame"]), iteration, exposures)
     except (KeyError, TypeError, AttributeError, IndexError, ValueError, RuntimeError) as error:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
 
@@ -107,8 +106,9 @@ def load_with_capture(
     if given is not None:
         require_model(path)  # before its capture is read
         scene = open_scene(given.scene, given.train.refine_cameras)
-        gaussians = load_given(path, scene, given.train.init_world).map(lambda value: value.to(device))
-        return SavedModel(None, given, gaussians, scene.frame, None, None, is_antialiased(path)), scene, ""
+        gaussians, antialiased = load_given(path, scene, given.train.init_world)
+        gaussians = gaussians.map(lambda value: value.to(device))
+        return SavedModel(None, given, gaussians, scene.frame, None, None, antialiased), scene, ""
     model = load_model(path, device)
     try:
         return model, open_scene(model.config.scene, model.config.train.refine_cameras, trained=True), ""
@@ -138,23 +138,18 @@ def require_model(path: str | Path) -> Path:
     return path
 
 
-def is_antialiased(path: str | Path) -> bool:
-    """Whether a model's file, which `read_given` takes, says that it is drawn with antialiasing."""
-    file = require_model(path)
-    return FORMATS[file.suffix.lower().removeprefix(".")].is_antialiased(file)
-
-
-def load_given(path: str | Path, scene: Scene, world: str = "capture") -> Gaussians:
-    """A model as `require_model` takes it, float32 on the CPU, in the frame of the scene that it was trained on.
-    Warnings count Gaussians that are not finite, which are left out, and say that it does not fit the capture's points.
+def load_given(path: str | Path, scene: Scene, world: str = "capture") -> tuple[Gaussians, bool]:
+    """A model as `require_model` takes it, float32 on the CPU, in the frame of the scene that it was trained on; and
+    whether its file says that it is drawn with antialiasing. Warnings count Gaussians that are not finite, which are
+    left out, and say that it does not fit the capture's points.
 
     `world` is `train.init_world`, the coordinates of a model that is not one of ours: ``capture`` or ``gsplat``. Raises
     `InputError` where the file is no such model, or the capture does not determine gsplat's world.
     """
-    gaussians, to_capture = read_given(path)
+    gaussians, antialiased, to_capture = read_given(path)
     if to_capture is None:
         to_capture = _to_capture(gaussians, require_model(path), scene, world)
-    return placed(gaussians, Similarity.into(scene.frame).after(to_capture), path)
+    return placed(gaussians, Similarity.into(scene.frame).after(to_capture), path), antialiased
 
 
 def _to_capture(gaussians: Gaussians, path: Path, scene: Scene, world: str) -> Similarity:
@@ -187,22 +182,24 @@ def _to_capture(gaussians: Gaussians, path: Path, scene: Scene, world: str) -> S
     return change
 
 
-def read_given(path: str | Path) -> tuple[Gaussians, Similarity | None]:
-    """A model from a file alone, float64 on the CPU in the file's own coordinates, some rows perhaps not finite; and
-    the change to its capture's own coordinates where the file knows it. Errors as of `require_model`."""
+def read_given(path: str | Path) -> tuple[Gaussians, bool, Similarity | None]:
+    """A model from a file alone, float64 on the CPU in the file's own coordinates, some rows perhaps not finite;
+    whether it is drawn with antialiasing; and the change to its capture's own coordinates where the file knows it.
+    Errors as of `require_model`."""
     file = require_model(path)
     kind = file.suffix.lower().removeprefix(".")
     if kind != "pt":
-        return FORMATS[kind].read(file), None
+        return *FORMATS[kind][1](file), None
     state = read_plain(file, f"'{file}'", REMEDY)
     if isinstance(state, Mapping) and "splats" in state:
         of_ranks = re.compile(re.sub(r"_rank\d+$", r"_rank\\d+", re.escape(file.stem)))  # with several, each has a part
         files = sorted(path for path in file.parent.glob("*.pt") if of_ranks.fullmatch(path.stem))
         parts = [read_gsplat(read_plain(part, f"'{part}'", REMEDY), part) for part in files]
-        return Gaussians(**{name: torch.cat([getattr(part, name) for part in parts]) for name in PARAMETER_NAMES}), None
+        whole = {name: torch.cat([getattr(part, name) for part in parts]) for name in PARAMETER_NAMES}
+        return Gaussians(**whole), False, None
     try:
         gaussians = read_gsplat({"splats": state["trainer"]["gaussians"]}, file)
-        return gaussians, Similarity.into(frame_of_state(state)).inverse()
+        return gaussians, False, Similarity.into(Frame(**state["frame"])).inverse()
     except (KeyError, TypeError):
         keys = ", ".join(sorted(map(str, state))[:6]) if isinstance(state, Mapping) else type(state).__name__
         raise InputError(

@@ -28,7 +28,7 @@ from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.scene.offload import OffloadedErrorMaps, place_views
 from turbogs_plugin.train.look import Background, Look, interpolated_exposures
 from turbogs_plugin.train.parameter_mean import ParameterMean
-from turbogs_plugin.train.saved_model import is_antialiased, load_given
+from turbogs_plugin.train.saved_model import load_given
 from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
 
 STATEFUL = ("maps", "view_sampler", "optimizer", "density")
@@ -249,8 +249,9 @@ def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
         settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
         gaussians = gaussians_from_points(points[rows], colors[rows], *settings)
     else:
-        gaussians = with_degree(load_given(init, scene, train.init_world), train.sh_degree)
-        if is_antialiased(init):
+        gaussians, antialiased = load_given(init, scene, train.init_world)
+        gaussians = with_degree(gaussians, train.sh_degree)
+        if antialiased:
             warnings.warn(f"'{init}' is of antialiased training: it goes on without, thicker at first", stacklevel=2)
         if cap and len(gaussians) + others > cap:
             raise InputError(

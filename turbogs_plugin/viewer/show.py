@@ -15,7 +15,7 @@ from turbogs_plugin.scene import Frame
 from turbogs_plugin.train.inputs import resolve_device
 from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.run_files import RunFolder
-from turbogs_plugin.train.saved_model import is_antialiased, load_with_capture, read_given
+from turbogs_plugin.train.saved_model import load_with_capture, read_given
 from turbogs_plugin.viewer.pictures import CaptureViews, ModelState
 from turbogs_plugin.viewer.server import Page, quoted, serve_until_interrupted
 
@@ -56,13 +56,13 @@ def open_state(path: Path, device: torch.device, given: Config | None = None) ->
         InputError: there is no usable model, or no usable capture of a run or where one was named.
     """
     if given is None and not RunFolder(path).config.is_file():
-        alone, _ = read_given(path)
+        alone, antialiased, _ = read_given(path)
         rows = alone.finite_rows()
         means = alone.means[rows] if rows.any() else torch.zeros(1, 3)
         middle = means.median(dim=0).values
         reach = float((means - middle).norm(dim=1).median()) or 1.0
         gaussians = placed(alone, Similarity.into(Frame(middle.numpy(), reach)), path)
-        look = Look(gaussians.sh_degree, DEFAULT_SETTINGS, antialiased=is_antialiased(path))
+        look = Look(gaussians.sh_degree, DEFAULT_SETTINGS, antialiased=antialiased)
         return ModelState(gaussians.map(lambda value: value.to(device)), look)
     model, scene, _ = load_with_capture(path, given, device)
     assert scene is not None, "the capture is needed"
