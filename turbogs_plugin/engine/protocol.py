@@ -171,10 +171,7 @@ class Engine(Protocol):
 
     def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
         """Make every row of the moments and the statistics valid, before they are read: after `update` some may not be.
-
-        Args:
-            moments: None where the statistics alone will be read, and more updates follow.
-        """
+        `moments`: None where the optimizer has no rule, so that `update` is never called."""
         return
 
     def agreed(self, update: RowUpdate | None) -> RowUpdate | None:

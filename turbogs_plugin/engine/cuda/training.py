@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from functools import lru_cache, partial
 from itertools import pairwise
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import torch
@@ -241,12 +240,9 @@ def _copies(copies: ModelCopies | None) -> SimpleNamespace:
 
 def expose_colors(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
     """`Engine.expose`."""
-    launch = launches.ExposeColors(
-        **_exposed(exposures, plain_floats(colors), samples),
-        exposed=torch.empty(len(colors), 3, device=colors.device),
-    )
-    library.launch(launch)
-    return launch.exposed
+    exposed = torch.empty(len(colors), 3, device=colors.device)
+    library.launch(launches.ExposeColors(_exposed_views(exposures, colors, samples), exposed))
+    return exposed
 
 
 def learn_exposures(
@@ -258,25 +254,20 @@ def learn_exposures(
     overflow: Tensor | None = None,
 ) -> Tensor:
     """`Engine.learn_exposures`, in two launches; `gradients`, where float32 and contiguous, is changed in place."""
-    exposed = _exposed(exposures, plain_floats(colors), samples)
-    backward = launches.ExposureBackward(
-        **exposed,
-        gradients=plain_floats(gradients),
-        sums=torch.zeros(len(samples.view_ids), 3, 4, dtype=torch.float64, device=colors.device),
-    )
-    library.launch(backward)
+    batch, gradients = _exposed_views(exposures, colors, samples), plain_floats(gradients)
+    sums = torch.zeros(len(samples.view_ids), 3, 4, dtype=torch.float64, device=colors.device)
+    library.launch(launches.ExposureBackward(batch, gradients, sums))
     adam = {"rate": rate, "beta1": BETA1, "beta2": BETA2, "eps": EPSILON, "pull": PULL}
-    library.launch(launches.ExposureStep(backward.sums, backward.views, backward.grid, exposures, overflow, **adam))
-    return backward.gradients
+    library.launch(launches.ExposureStep(sums, batch.views, batch.grid, exposures, overflow, **adam))
+    return gradients
 
 
-def _exposed(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> dict[str, Any]:
-    """Arguments of `launches.ExposedViews`. `colors`: [P, 3] float32, contiguous."""
-    return {
-        "colors": colors,
-        "tile_ids": samples.tile_ids,
-        "tile_offsets": samples.tile_offsets,
-        "views": view_rows([0] * len(samples.view_ids), samples.sizes.tolist(), samples.view_ids),
-        "grid": launches.GridOrigin(*samples.origin),
-        "offsets": exposures.offsets,
-    }
+def _exposed_views(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> launches.ExposedViews:
+    return launches.ExposedViews(
+        colors=plain_floats(colors),
+        tile_ids=samples.tile_ids,
+        tile_offsets=samples.tile_offsets,
+        views=view_rows([0] * len(samples.view_ids), samples.sizes.tolist(), samples.view_ids),
+        grid=launches.GridOrigin(*samples.origin),
+        offsets=exposures.offsets,
+    )
