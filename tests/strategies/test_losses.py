@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from turbogs_plugin.engine.reference.losses import TileGroups, window_similarity
+from turbogs_plugin.engine.reference.losses import Problem, window_similarity
 from turbogs_plugin.strategies.losses import EPSILON, CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.tiles import pixel_table
 from turbogs_plugin.types import PixelSamples
@@ -151,9 +151,8 @@ def test_windows_stay_bounded_where_their_variance_is_lost(level):
     x, y = samples.coordinates().float().unbind(dim=1)
     targets = torch.where(x < 8, level, 0.1)[:, None].repeat(1, 3)
     for colors in (targets + 0.01 * torch.sin(9.0 * x + 5.0 * y)[:, None], targets.flip(0)):
-        similarity, slopes = window_similarity(colors, targets, samples, TileGroups(samples, torch.ones(256)))
-        exact = TileGroups(samples, torch.ones(256, dtype=torch.float64))
-        _, exact_slopes = window_similarity(colors.double(), targets.double(), samples, exact)
+        similarity, slopes = window_similarity(Problem(colors, targets, samples, 1e-3))
+        _, exact_slopes = window_similarity(Problem(colors.double(), targets.double(), samples, 1e-3))
         assert similarity.abs().max() <= 1 + 1e-6
         assert slopes.abs().max() <= min(SSIM_SLOPE, 1.01 * exact_slopes.abs().max())
 

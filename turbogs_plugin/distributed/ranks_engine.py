@@ -159,13 +159,9 @@ class RanksEngine:
         self._exchange.stepped(gaussians)
 
     def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
-        if self._owned is None:
+        if self._owned is None or moments is None:
             return
         statistics = [] if stats is None else list(vars(stats).values())
-        if moments is None:
-            if statistics:
-                gather_rows(self.ranks, statistics)
-            return
         self._owned = None  # an event makes new tensors, beside which the old ones have no room
         tensors = [moments.exp_avg, moments.exp_avg_sq, moments.exp_avg_shN, moments.exp_avg_sq_shN, moments.steps]
         gather_rows(self.ranks, tensors + statistics)
