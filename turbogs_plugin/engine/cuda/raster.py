@@ -226,8 +226,8 @@ def rasterize_cuda(
     options: RenderOptions = DEFAULT_OPTIONS,
     workspace: Workspace | None = None,
 ) -> CudaRendered:
-    """`Engine.render`, on torch's current stream of the Gaussians' device. `workspace`: memory to reuse, so that nothing
-    waits for the GPU; `Workspace` says what the caller must then do.
+    """`Engine.render`, on torch's current stream of the Gaussians' device. `workspace`: memory to reuse, so that
+    nothing waits for the GPU; `Workspace` says what the caller must then do.
 
     Raises:
         InputError: cameras of other image sizes than the samples', or more intersections than a pass can have.
