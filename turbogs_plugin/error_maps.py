@@ -70,7 +70,7 @@ class ErrorMaps:
             self._pixel_counts = self.masks.pixel_counts.clip(min=1)
         self._allocate()
         self.view_sums = torch.zeros(len(self.sizes), dtype=torch.float64, device=self.device)
-        self._means = _LaggedCopy(self.view_sums, self.refresh)
+        self._means = LaggedCopy(self.view_sums, self.refresh)
 
     def _allocate(self) -> None:
         self.offsets = np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1))])  # [V + 1]
@@ -223,7 +223,7 @@ class ErrorMaps:
         self._stamps.copy_(function(self._stamps))
 
 
-class _LaggedCopy:
+class LaggedCopy:
     """The values of a small device tensor on the host, a fixed number of reads late; see `ErrorMaps.view_means`."""
 
     def __init__(self, source: Tensor, refresh: int) -> None:
