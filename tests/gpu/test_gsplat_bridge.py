@@ -168,12 +168,11 @@ def test_relocation_works_on_shared_optimizers(rule):
 
 def test_a_whole_step_whose_loss_is_read_waits_for_nothing():
     """A trainer shows the loss at every step: by then it lies on the host."""
-    splats = make_splats(COUNT, device="cuda")
-    views = [
-        {"image": 255 * image.cpu(), "K": K, "camtoworld": torch.linalg.inv(viewmat)}
-        for image, K, viewmat in zip(truth(make_cameras(3).to("cuda")), *camera_tensors(), strict=True)
-    ]
-    turbo = TurboStep(splats, views, max_steps=200, overrides=("train.backdrop=false", "density.refine_from=150"))
+    cameras, photos = make_cameras(3), 255 * truth(make_cameras(3, "cuda")).cpu()
+    poses = torch.linalg.inv(cameras.viewmats)
+    views = [{"image": photos[i], "K": cameras.Ks[i], "camtoworld": poses[i]} for i in range(3)]
+    options = ("train.backdrop=false", "density.refine_from=150")
+    turbo = TurboStep(splats_on_gpu(), views, max_steps=200, overrides=options)
     seen = [float(turbo.step(step).loss) for step in range(40)]
     torch.cuda.synchronize()
     torch.cuda.set_sync_debug_mode("error")
@@ -182,8 +181,3 @@ def test_a_whole_step_whose_loss_is_read_waits_for_nothing():
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert 0 < seen[-1] < seen[0]
-
-
-def camera_tensors() -> tuple[torch.Tensor, torch.Tensor]:
-    cameras = make_cameras(3)
-    return cameras.Ks, cameras.viewmats

@@ -51,9 +51,7 @@ LAG = 16
 class StepInfo:
     """What a step gives. The host waits for a GPU where `psnr` is read, and nowhere else."""
 
-    loss: (
-        Tensor  # [] float32, on the host, of the samples before an update: this step's; on a GPU one's of 16 to 31 ago
-    )
+    loss: Tensor  # [] float32 on the host, before the update; on a GPU that of a step 16 to 31 before
     num_gaussians: int  # after the step
     num_samples: int  # pixels of the step, empty slots among them
     _colors: Tensor
