@@ -76,7 +76,7 @@ class CharbonnierNccLoss(RuleLoss):
             printed NCC adds it as its epsilon to a product of two variances: 1e-6 there means two variances of 1e-3.
     """
 
-    ncc_weight: float = 0.4
+    ncc_weight: float = 1.0
     structure: Literal["ncc", "printed_ncc"] = "ncc"
     variance_constant: float = STRUCTURE_CONSTANT
 

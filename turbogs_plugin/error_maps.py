@@ -70,7 +70,7 @@ class ErrorMaps:
             self._pixel_counts = self.masks.pixel_counts.clip(min=1)
         self._allocate()
         self.view_sums = torch.zeros(len(self.sizes), dtype=torch.float64, device=self.device)
-        self._means = _LaggedCopy(self.view_sums, self.refresh)
+        self._means = LaggedCopy(self.view_sums, self.refresh)
 
     def _allocate(self) -> None:
         self.offsets = np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1))])  # [V + 1]
@@ -104,22 +104,12 @@ class ErrorMaps:
         return maps
 
     def fetch(self, view_ids: Sequence[int]) -> None:
-        """Make the maps of these views available in `errors` and `stamps`, from `offsets` on.
-
-        Call it before reading or writing these arrays. All views are always there in `ErrorMaps`; see
-        `scene/offload.py`.
-        """
+        """Make the maps of these views available in `errors` and `stamps`, from `offsets` on. To be called before these
+        arrays are read or written. Here all views are always there; see `scene/offload.py`."""
 
     def initialise(self, view_id: int, errors: Tensor) -> None:
-        """Set the errors of one whole view.
-
-        Args:
-            errors: [H * W] float, detached here; an error that is not finite, is below 0 or is a masked pixel's
-                counts as zero.
-
-        Raises:
-            InputError: another shape.
-        """
+        """Set the errors of one whole view: [H * W] float, detached here. An error that is not finite, is below 0 or is
+        a masked pixel's counts as zero. Raises `InputError` for another shape."""
         width, height = self.sizes[view_id]
         if errors.shape != (width * height,):
             raise InputError(f"errors of view {view_id} have shape {tuple(errors.shape)}, expected ({width * height},)")
@@ -233,7 +223,7 @@ class ErrorMaps:
         self._stamps.copy_(function(self._stamps))
 
 
-class _LaggedCopy:
+class LaggedCopy:
     """The values of a small device tensor on the host, a fixed number of reads late; see `ErrorMaps.view_means`."""
 
     def __init__(self, source: Tensor, refresh: int) -> None:

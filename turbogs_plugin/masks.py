@@ -105,12 +105,8 @@ class PixelMasks:
         return [int(self.offsets[view + 1] - self.offsets[view]) for view in view_ids]
 
     def live_tiles(self, view_ids: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """The live tiles of a batch of views.
-
-        Returns:
-            [T] int64 their ids in ``TileGrid(sizes of these views)``, ascending; and [T, 256] bool, which of a tile's
-            places (`sample_order`) count. Places outside the image may be True.
-        """
+        """The live tiles of a batch of views: [T] int64 their ids in ``TileGrid(sizes of these views)``, ascending; and
+        [T, 256] bool, which of a tile's places (`sample_order`) count. Places outside the image may be True."""
         firsts = TileGrid(self.sizes[list(view_ids)]).starts
         spans = [slice(int(self.offsets[view]), int(self.offsets[view + 1])) for view in view_ids]
         tiles = torch.cat([self.tiles[span].long() + first for span, first in zip(spans, firsts, strict=False)])

@@ -15,14 +15,6 @@ from turbogs_plugin.types import TILE_SIZE, PixelSamples, TileGrid, sample_order
 TILE_PIXELS = TILE_SIZE * TILE_SIZE
 
 
-def _places(device: torch.device | str) -> tuple[Tensor, Tensor]:
-    """x and y within the tile, [256] int32 each, of the places of a tile in `sample_order`."""
-    pixels = torch.arange(TILE_PIXELS, dtype=torch.int32, device=device)
-    x, y = pixels % TILE_SIZE, pixels // TILE_SIZE
-    order = torch.argsort(sample_order(x, y))
-    return x[order], y[order]
-
-
 @dataclass(frozen=True)
 class DrawEnds:
     """`PixelSamples.host_ends` of a draw whose sizes the host knows. Equal draws have equal ends.
@@ -52,7 +44,9 @@ class DrawEnds:
 def pixel_table(sizes: np.ndarray, device: torch.device | str, origin: tuple[int, int] = (0, 0)) -> Tensor:
     """[T, 256] int32: the pixel id of each place of each tile of ``TileGrid(sizes, origin)``, in `sample_order`; -1
     outside."""
-    x, y = _places(device)
+    pixels = torch.arange(TILE_PIXELS, dtype=torch.int32, device=device)
+    pixels = pixels[torch.argsort(sample_order(pixels % TILE_SIZE, pixels // TILE_SIZE))]
+    x, y = pixels % TILE_SIZE, pixels // TILE_SIZE  # within the tile
     tables = []
     for width, height in sizes.tolist():
         starts_x, starts_y = (

@@ -63,7 +63,6 @@ class DenseAdam:
     @torch.no_grad()
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
         require("counts" in vars(self), "optimizer", type(self).__name__, "set up, by setup(gaussians) before step")
-        gradients = gradients.over_views()
         finite, touched = finite_gradients(gradients), gradients.touched
         self.skipped += (touched & ~finite).sum()
         rates = self.learning_rates.at(step)

@@ -24,9 +24,9 @@ def numerics() -> Iterator[ModuleType]:
 
 def test_the_exact_solution_solves_the_system(numerics):
     problem = numerics.make_problem(numerics.FAMILIES[2], views=3, count=50, seed=0)
-    rows, weights, damping, rhs = (value.double().numpy().astype(np.longdouble) for value in problem)
+    rows, damping, rhs = (value.double().numpy().astype(np.longdouble) for value in problem)
     solution = solve_exactly(*problem) / np.sqrt(damping)
-    left = np.einsum("kn,kni,knj,nj->ni", weights, rows, rows, solution) + damping * solution
+    left = np.einsum("kni,knj,nj->ni", rows, rows, solution) + damping * solution
     bound = 1e-12 * np.sqrt(damping) * np.linalg.norm(rhs / np.sqrt(damping), axis=1)[:, None]
     assert (np.abs(left - rhs) <= bound).all()
 

@@ -14,7 +14,7 @@ from turbogs_plugin.captures.bundle_adjustment import (
     refine_together,
     reprojection_errors,
 )
-from turbogs_plugin.scene.scene import Observations
+from turbogs_plugin.scene.geometry import Observations
 
 
 def same(first: Pinholes, second: Pinholes, view: int | slice = slice(None)) -> bool:

@@ -3,8 +3,8 @@
 import re
 
 import pytest
-from turbogs_plugin.captures.camera_json import read_frames
 
+from turbogs_plugin.captures.transforms import read_frames
 from turbogs_plugin.config.components import KINDS, strategy_class
 from turbogs_plugin.config.configuration import (
     SECTION_CLASSES,

@@ -16,9 +16,8 @@ from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.engine.render_pass import RenderOptions
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene import Photos, PosedImages
 from turbogs_plugin.scene.depths import CELL, DepthPair, InverseDepths
-from turbogs_plugin.scene.scene import Observations
+from turbogs_plugin.scene.geometry import Observations
 from turbogs_plugin.strategies.losses import EPSILON, CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import PARAMETER_NAMES
@@ -107,9 +106,7 @@ def test_points_tell_the_depth_where_photos_show_them():
         np.array([0, 0, 1, 1, 1]),
         np.array([0, 0, 2, 0, 3]),
     )
-    photos = Photos(torch.zeros(2400, 3, dtype=torch.uint8), cameras.sizes)
-    views = PosedImages(cameras, ("a", "b"), photos, observations=shown)
-    known = InverseDepths.of(views, points)
+    known = InverseDepths.of(cameras, shown, points)
     expected = torch.zeros(2, 8, 10)
     for view, point in ((0, 0), (1, 2)):
         x, y = (pixels[view, point] // CELL).astype(int)
@@ -117,14 +114,14 @@ def test_points_tell_the_depth_where_photos_show_them():
     torch.testing.assert_close(known.cells.view(2, 8, 10), expected)
     assert known.share == 2 * CELL**2 / 2400
     nearer = replace(shown, point_ids=np.array([1, 0, 2, 0, 3]), pixels=shown.pixels.copy())
-    both = replace(views, cameras=cameras.select((0, 0)), observations=nearer)
-    both.cameras.viewmats[:] = torch.eye(4)
-    both.cameras.viewmats[:, 2, 3] = 4.0
-    nearer.pixels[:2] = both.cameras.Ks[0, :2, 2]
-    assert float(InverseDepths.of(both, points).cells.max()) == 0.25, "the farther point is 6 away"
+    both = cameras.select((0, 0))
+    both.viewmats[:] = torch.eye(4)
+    both.viewmats[:, 2, 3] = 4.0
+    nearer.pixels[:2] = both.Ks[0, :2, 2]
+    assert float(InverseDepths.of(both, nearer, points).cells.max()) == 0.25, "the farther point is 6 away"
     for none in (None, Observations(np.zeros((0, 2)), np.zeros(0, int), np.zeros(0, int))):
         with pytest.raises(InputError, match=r"^loss\.depth_weight: this capture does not say where photos show"):
-            InverseDepths.of(replace(views, observations=none), points)
+            InverseDepths.of(cameras, none, points)
 
 
 @pytest.mark.parametrize("loss", [CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss])
@@ -138,7 +135,7 @@ def test_training_with_the_term_brings_depths_nearer(tmp_path):
     """Against the same steps without it, at the pixels of the capture's points."""
     capture = tiny_capture(tmp_path)
     scene, errors = load_scene(capture), []
-    known = InverseDepths.of(scene.train, scene.points)
+    known = InverseDepths.of(scene.train.cameras, scene.train.observations, scene.points)
     for weight in (0.0, 1.0):
         config = tiny_config(capture, f"loss.depth_weight={weight}", "train.dropout=0").without_plan()
         trainer = Trainer(config, scene, torch.device("cpu"))

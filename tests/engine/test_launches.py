@@ -52,7 +52,7 @@ def marked(cls, prefix=()):
     """An object of a class of `launches` whose every field names itself, and the fields by list in their order."""
     fields, lists = {}, {"Tensors": [], "Integers": [], "Reals": [], "rows": [], "more": []}
     kinds = {"Tensor": "Tensors", "Tensor | None": "Tensors", "int": "Integers", "bool": "Integers", "float": "Reals"}
-    for name, annotation in launches.field_types(cls).items():
+    for name, annotation in cls.__annotations__.items():
         if annotation == "list[int]":
             fields[name] = ["rows", *prefix, name]
             lists["rows"] += fields[name]

@@ -8,7 +8,13 @@ from helpers.raster_cases import GPU_ONLY
 
 from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_loss, sparse_rasterization
+from turbogs_plugin.gsplat_bridge import (
+    SharedOptimizer,
+    TurboDensityStrategy,
+    TurboStep,
+    sparse_loss,
+    sparse_rasterization,
+)
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 from turbogs_plugin.strategies.losses import CharbonnierNccLoss
 from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
@@ -158,3 +164,20 @@ def test_relocation_works_on_shared_optimizers(rule):
     assert len(splats["means"]) == COUNT + 30
     assert all(value.isfinite().all() for value in splats.values())
     assert all(loss == loss for loss in losses)
+
+
+def test_a_whole_step_whose_loss_is_read_waits_for_nothing():
+    """A trainer shows the loss at every step: by then it lies on the host."""
+    cameras, photos = make_cameras(3), 255 * truth(make_cameras(3, "cuda")).cpu()
+    poses = torch.linalg.inv(cameras.viewmats)
+    views = [{"image": photos[i], "K": cameras.Ks[i], "camtoworld": poses[i]} for i in range(3)]
+    options = ("train.backdrop=false", "density.refine_from=150")
+    turbo = TurboStep(splats_on_gpu(), views, max_steps=200, overrides=options)
+    seen = [float(turbo.step(step).loss) for step in range(40)]
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        seen += [float(turbo.step(step).loss) for step in range(40, 44)]
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert 0 < seen[-1] < seen[0]

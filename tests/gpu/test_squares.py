@@ -65,7 +65,7 @@ def test_the_same_rows_are_drawn_as_on_a_cpu(count, value):
 
 def test_the_loss_is_close_to_float64_on_stiff_tiles():
     """So it is bounded there as the reference's is (tests/stability/test_structure_term.py)."""
-    terms = CharbonnierNccLoss(ncc_weight=1.0).terms
+    terms = CharbonnierNccLoss().terms
     exact = gradients(terms, "cpu", torch.float64)
     for name, got, wanted in zip(TILES, gradients(terms, "cuda"), exact, strict=True):
         assert (got - wanted).norm() <= STRUCTURE_BOUND * wanted.norm().clamp(min=1e-9), name

@@ -28,7 +28,7 @@ CASES = {
     "l1": CharbonnierLoss(),
     "ncc": CharbonnierNccLoss(),
     "ssim": SparseSsimLoss(),
-    "printed": CharbonnierNccLoss(structure="printed_ncc", ncc_weight=1.0, variance_constant=1e-6),
+    "printed": CharbonnierNccLoss(structure="printed_ncc", variance_constant=1e-6),
 }
 
 

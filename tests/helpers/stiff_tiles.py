@@ -74,7 +74,7 @@ def stiff_tiles() -> tuple[Photos, Tensor, PixelSamples]:
 
 def structure_gradients(device: str, dtype: torch.dtype = torch.float32) -> list[Tensor]:
     """The gradient of the NCC term at weight 1 alone, [n, 3] float64 on the CPU, of each tile of `TILES`."""
-    full = gradients(CharbonnierNccLoss(ncc_weight=1.0).terms, device, dtype)
+    full = gradients(CharbonnierNccLoss().terms, device, dtype)
     alone = gradients(CharbonnierNccLoss(ncc_weight=0.0).terms, device, dtype)
     return [whole - l1 for whole, l1 in zip(full, alone, strict=True)]
 

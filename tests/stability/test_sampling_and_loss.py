@@ -75,7 +75,7 @@ def test_gradients_of_any_tiles_are_finite_and_bounded(counts, levels, truth, st
     offsets = torch.tensor(np.concatenate([[0], np.cumsum(counts)]), dtype=torch.int32)
     pixel_ids = torch.arange(slots, dtype=torch.int32)
     samples = PixelSamples((0,), np.array([[16 * len(counts), 16]]), pixel_ids, tiles, offsets)
-    for loss in (CharbonnierNccLoss(ncc_weight=1.0, structure=structure), SparseSsimLoss()):
+    for loss in (CharbonnierNccLoss(structure=structure), SparseSsimLoss()):
         result = loss(colors, targets, samples)
         assert all(value.isfinite().all() for value in (result.loss, result.color_gradients, result.pixel_errors))
         assert (result.color_gradients[~colors.isfinite().all(dim=1)] == 0).all()  # half precision ends at 65504

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from turbogs_plugin.engine.reference.losses import TileGroups, window_similarity
+from turbogs_plugin.engine.reference.losses import Problem, window_similarity
 from turbogs_plugin.strategies.losses import EPSILON, CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.tiles import pixel_table
 from turbogs_plugin.types import PixelSamples
@@ -14,7 +14,7 @@ from turbogs_plugin.types import PixelSamples
 EVERY = [
     CharbonnierLoss(),
     CharbonnierNccLoss(),
-    CharbonnierNccLoss(ncc_weight=1.0, variance_constant=1e-6),
+    CharbonnierNccLoss(variance_constant=1e-6),
     CharbonnierNccLoss(ncc_weight=0.5, variance_constant=1e-4),
     SparseSsimLoss(),
     SparseSsimLoss(ssim_weight=1.0),
@@ -151,9 +151,8 @@ def test_windows_stay_bounded_where_their_variance_is_lost(level):
     x, y = samples.coordinates().float().unbind(dim=1)
     targets = torch.where(x < 8, level, 0.1)[:, None].repeat(1, 3)
     for colors in (targets + 0.01 * torch.sin(9.0 * x + 5.0 * y)[:, None], targets.flip(0)):
-        similarity, slopes = window_similarity(colors, targets, samples, TileGroups(samples, torch.ones(256)))
-        exact = TileGroups(samples, torch.ones(256, dtype=torch.float64))
-        _, exact_slopes = window_similarity(colors.double(), targets.double(), samples, exact)
+        similarity, slopes = window_similarity(Problem(colors, targets, samples, 1e-3))
+        _, exact_slopes = window_similarity(Problem(colors.double(), targets.double(), samples, 1e-3))
         assert similarity.abs().max() <= 1 + 1e-6
         assert slopes.abs().max() <= min(SSIM_SLOPE, 1.01 * exact_slopes.abs().max())
 
@@ -181,7 +180,7 @@ def test_printed_ncc_is_the_appendix():
     colors, targets, samples = random_case(counts=(9, 16), empty=(1, 0))
     x, y = 0.05 * colors.numpy(), 0.05 * targets.numpy()  # variances of 1e-4, where epsilon counts
     for epsilon, far_above in ((1e-6, False), (1e-14, True)):
-        loss = CharbonnierNccLoss(ncc_weight=1.0, structure="printed_ncc", variance_constant=epsilon)
+        loss = CharbonnierNccLoss(structure="printed_ncc", variance_constant=epsilon)
         result = loss(torch.as_tensor(x), torch.as_tensor(y), samples)
         plain = CharbonnierLoss()(torch.as_tensor(x), torch.as_tensor(y), samples)
         value, gradient = 0.0, np.zeros_like(x)
@@ -207,11 +206,11 @@ def test_printed_ncc_is_the_appendix():
 def test_a_flat_tile_scores_zero_as_printed_and_one_with_the_floor():
     colors, targets = torch.rand(30, 3, generator=torch.Generator().manual_seed(6)), torch.full((30, 3), 0.3)
     plain = CharbonnierLoss()(colors, targets, make_samples([30]))
-    printed = CharbonnierNccLoss(ncc_weight=1.0, structure="printed_ncc")(colors, targets, make_samples([30]))
+    printed = CharbonnierNccLoss(structure="printed_ncc")(colors, targets, make_samples([30]))
     assert torch.equal(printed.color_gradients, plain.color_gradients)  # no information, no gradient
     flat = torch.full((30, 3), 0.3)
     for structure, score in (("printed_ncc", 0.0), ("ncc", 1.0)):
-        loss = CharbonnierNccLoss(ncc_weight=1.0, structure=structure)(flat + 0.2, flat, make_samples([30])).loss
+        loss = CharbonnierNccLoss(structure=structure)(flat + 0.2, flat, make_samples([30])).loss
         l1 = CharbonnierLoss()(flat + 0.2, flat, make_samples([30])).loss
         assert (loss - l1).item() == pytest.approx(1.0 - score, abs=1e-6)
 

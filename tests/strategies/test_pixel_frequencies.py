@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers.sampling_cases import SIGMAS, random_maps, step, successive
 
-from turbogs_plugin.engine.reference.draws import Units, draw_units
+from turbogs_plugin.engine.reference.draws import draw_units
 from turbogs_plugin.engine.reference.philox import PURPOSE_PIXELS, random_words
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
@@ -131,8 +131,8 @@ def test_weights_make_sums_unbiased(stages, columns, wanted, tolerance):
     ages = torch.randint(1, 2 if stages[1] == 1.0 else 4, (rows, columns), generator=generator)
     exist = torch.ones_like(ages, dtype=torch.bool)
     words = random_words(place, 0, PURPOSE_PIXELS, 0, 0)
-    units = Units(errors.expand(rows, columns), ages, exist, words, wanted)
-    drawn, probabilities = draw_units(units, DrawRule("pixel", *stages, False, 1.0))
+    rule = DrawRule("pixel", *stages, False, 1.0)
+    drawn, probabilities = draw_units(errors.expand(rows, columns), ages, exist, words, wanted, rule)
     assert (drawn.sum(dim=1) == wanted).all()
     assert ((probabilities[drawn] > 0) & (probabilities[drawn] <= 1)).all()
     for quantity in (torch.ones(columns, dtype=torch.float64), values):

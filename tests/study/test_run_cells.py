@@ -239,8 +239,8 @@ def test_a_cell_has_the_planned_length_and_keeps_a_cap_on_gaussians(tmp_path, mo
 
 
 def test_a_limit_of_memory_which_is_of_a_process_is_refused():
-    with pytest.raises(run_cells.InputError, match=r"variant 'sparse-adam'.*max_memory.*max_gaussians"):
-        variant_config(load_ablation("parts"), "sparse-adam", 0, ("budget.max_memory=2GiB",), None)
+    with pytest.raises(run_cells.InputError, match=r"variant 'moment-lm'.*max_memory.*max_gaussians"):
+        variant_config(load_ablation("parts"), "moment-lm", 0, ("budget.max_memory=2GiB",), None)
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,9 @@ from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.report.curves import plot_against_seconds
 from turbogs_plugin.report.images import save_image
 from turbogs_plugin.train import run
-from turbogs_plugin.train.history import Evaluation, append_evaluation
+from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history
 from turbogs_plugin.train.run_files import RunFolder
+from turbogs_plugin.train.trainer import Trainer
 
 HOLDING = """
 import sys, time
@@ -74,6 +75,24 @@ def test_a_new_folder_that_another_has_written_to_and_a_lock_that_is_a_link_are_
     with pytest.raises(InputError, match="is a link: remove it"), folder.owned():
         pytest.fail("it was followed")
     assert victim.read_text() == "mine"
+
+
+def test_a_run_that_ends_before_its_first_checkpoint_does_not_claim_its_folder(capture, tmp_path, monkeypatch):
+    folder, config = RunFolder(tmp_path / "run"), tiny_config(capture, "train.iterations=2", "train.evaluate_at=[]")
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", lambda trainer: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            run.train(config, folder.path)
+    folder.checkpoints.mkdir()
+    (folder.checkpoints / ".iteration-000002.pt.part").touch()
+    (folder.path / "notes.txt").touch()
+    with pytest.raises(InputError, match="is not empty: choose a new folder"):
+        folder.require_new()
+    (folder.path / "notes.txt").unlink()
+    run.train(config, folder.path)
+    assert [line.iteration for line in read_history(folder.history)] == [0, 2]
+    with pytest.raises(InputError, match="is not empty: choose a new folder"):
+        folder.require_new()
 
 
 WRITERS = {

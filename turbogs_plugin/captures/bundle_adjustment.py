@@ -27,7 +27,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.scene.scene import Observations, Scene
+from turbogs_plugin.scene.geometry import Observations
+from turbogs_plugin.scene.scene import Scene
 from turbogs_plugin.types import Cameras
 
 ROUNDS, CAMERA_STEPS, RESECTION_STEPS = 6, 2, 10

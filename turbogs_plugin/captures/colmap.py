@@ -19,7 +19,7 @@ from turbogs_plugin.captures.photo_files import IMAGES, find_named
 from turbogs_plugin.captures.starting_points import clouds_beside
 from turbogs_plugin.captures.undistort import Lens, lens_of_camera
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.scene import Observations
+from turbogs_plugin.scene.geometry import Observations
 
 if TYPE_CHECKING:
     import pycolmap

@@ -98,10 +98,8 @@ def _capture(
     scene: Path, source: Path, content: dict[str, Any], frames: list[Frame], test: Collection[str], words: str
 ) -> Capture:
     """The capture of some frames, in the order of their photos' names; damaged poses are left out (`Capture.checked`).
-
     `content` is the file's, whose ``ply_file_path`` has the points; `test` has written names of the test photos: where
-    none of them exists, there is no own split; `words` are on the kind of capture.
-    """
+    none of them exists, there is no own split; `words` are on the kind of capture."""
     names, cloud = [_written(frame) for frame in frames], content.get("ply_file_path")
     others = {text for frame in frames for key, text in frame.items() if key != "file_path" and isinstance(text, str)}
     found = find_named(scene, [frame["file_path"] for frame in frames], source, ("", "images"), others)
@@ -116,6 +114,9 @@ def _capture(
         mask = None if "mask_path" not in frame else _file(scene, frame["mask_path"], f"mask_path of {owner}", source)
         rows.append((pose, *_read_camera(frame, found.folder / name, source), mask))
     viewmats, Ks, sizes, lenses, masks = zip(*rows, strict=True)
+    axes = {"opengl": np.eye(4), "opencv": OTHER_AXES}.get(str(content.get("axes", "opengl")).lower())
+    if axes is None:
+        raise InputError(f'{source}: its axes are {str(content["axes"])[:40]!r}: write "opengl" or "opencv"')
     points, colors, file = np.empty((0, 3)), None, None
     if cloud is not None:
         points, colors, grey = read_cloud(file := _file(scene, cloud, "ply_file_path", source))
@@ -127,7 +128,7 @@ def _capture(
     return Capture(
         names=found.names,
         photo_folder=found.folder,
-        viewmats=(OTHER_AXES if content.get("axes") == "opencv" else np.eye(4)) @ viewmats,
+        viewmats=axes @ viewmats,
         Ks=np.array(Ks),
         sizes=np.array(sizes),
         points=points,

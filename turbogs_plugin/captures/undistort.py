@@ -23,8 +23,8 @@ LARGEST_SIDE = 65535
 """Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
 STRAIGHT_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """COLMAP's camera models that are a pinhole where all their parameters of distortion, if any, are 0."""
-WIDEST_ANGLE = math.radians(60.0)
-"""Largest angle off the axis in the pinhole image: a fisheye's rim would become a smear."""
+WIDEST = math.tan(math.radians(60.0))
+"""Tangent of the largest angle off the axis in the pinhole image: a fisheye's rim would become a smear."""
 LARGEST_GROWTH = 2.0
 """The pinhole image has at most this many times the sides of the photo (COLMAP's `max_scale`)."""
 GRID = 129  # places along either side of a pinhole image at which it is checked against the photo
@@ -106,9 +106,7 @@ def _lens(model: str, size: tuple[int, int], params: tuple[float, ...]) -> Lens 
 def _options() -> pycolmap.UndistortCameraOptions:
     import pycolmap
 
-    return pycolmap.UndistortCameraOptions(
-        blank_pixels=0.0, max_scale=LARGEST_GROWTH, max_cam_point_norm=math.tan(WIDEST_ANGLE)
-    )
+    return pycolmap.UndistortCameraOptions(blank_pixels=0.0, max_scale=LARGEST_GROWTH, max_cam_point_norm=WIDEST)
 
 
 def _fits(lens: Lens) -> bool:

@@ -30,7 +30,8 @@ class RunOptions:
     """Options of train and plan that change a configuration.
 
     Args:
-        config: name of a packaged configuration or a .yaml file; turbogs where absent.
+        config: turbogs where absent; turbogs-big, -ssim, -paper, paper-literal, 3dgs, 3dgs-as-shipped, mcmc, demo; or
+            a .yaml file.
         factor: scale photos down by this.
         device: where to train; auto takes a GPU where there is one.
         max_gaussians: limit of the finished model (density.max_gaussians). While it grows it may have some more.

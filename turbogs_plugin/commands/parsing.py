@@ -87,10 +87,9 @@ def _unknown_option(function: Command, words: Sequence[str]) -> str:
             continue
         remedy = nearest(option, (f"--{entry.replace('_', '-')}" for entry in known))
         if "overrides" in signature(function).parameters:
-            from turbogs_plugin.config.configuration import load_config
+            from turbogs_plugin.config.configuration import settings_named
 
-            sections = load_config("turbogs").to_mapping().items()
-            settings = [f"{section}.{name}={value if equals else behind}" for section, keys in sections if name in keys]
+            settings = [f"{setting}={value if equals else behind}" for setting in settings_named(name)]
             remedy = f"write {' or '.join(settings)}" if settings else remedy
         return f"there is no {option}: {remedy}"
     return ""

@@ -153,13 +153,11 @@ def demo(path: Positional[Path], /) -> int:
 
 def _tell(session: RunSession, reported: bool) -> int:
     """Print how a training call ended, and give its exit code."""
-    from turbogs_plugin.report.tables import history_table
-
     folder = session.folder
     if session.signal is not None:
         print(f"stopped and saved: go on with  turbogs train --resume {shlex.quote(str(folder.path))}", file=sys.stderr)
         return 128 + session.signal
-    print(f"{history_table(session.history)}\n\n{session.wall.text()}")
+    print(session.wall.text())
     if reported:
         print(f"report  {folder.report}\nrenders {folder.path / 'report'}")
     print(f"model   {folder.model}")

@@ -92,7 +92,7 @@ def build(kind: str, mapping: Any) -> Any:
         raise InputError(f"{kind}: expected a mapping with a 'type', got {mapping!r}")
     type_name = mapping.get("type", default_type(kind))
     found = strategy_class(kind, type_name)
-    strategy: Any = build_dataclass(found, {key: value for key, value in mapping.items() if key != "type"}, kind)
+    strategy: Any = build_dataclass(found, mapping, kind, apart=("type",))
     return completed(kind, strategy, f"{kind}.type '{type_name}'")
 
 

@@ -179,7 +179,8 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         path, separator, text = override.partition("=")
         keys = path.strip().split(".")
         if not separator or len(keys) < 2 or not all(keys):
-            hint = f", as {keys[0]}.type={text} is" if separator and keys[0] in KINDS else ""
+            meant = [f"{name}={text}" for name in settings_named(keys[0])]
+            hint = f": write {' or '.join(meant)}" if separator and meant else ""
             raise InputError(f"override '{override}' is not of the form section.key=value{hint}")
         if not text.strip():
             raise InputError(f"override '{override}' lacks a value: write one behind the =, or null for none")
@@ -191,6 +192,15 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
             nested = {key: nested}
         result = _merge(result, nested)
     return result
+
+
+def settings_named(word: str) -> list[str]:
+    """The settings, ``section.key``, that a word may mean: a key, a whole setting, or a kind of strategy."""
+    if word in KINDS:
+        return [f"{word}.type"]
+    given, _, key = word.rpartition(".")
+    sections = load_config().to_mapping().items()
+    return [f"{section}.{key}" for section, keys in sections if key in keys and given in ("", section)]
 
 
 def _load_mapping(name_or_file: str, depth: int = 0) -> dict[str, Any]:

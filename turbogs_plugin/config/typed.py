@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import cache
@@ -29,9 +29,10 @@ def settings_of(cls: type) -> dict[str, Field[Any]]:
     return {field.name: field for field in fields(cls) if field.init and field.metadata.get("setting", True)}
 
 
-def build_dataclass(cls: type[T], mapping: Any, where: str) -> T:
+def build_dataclass(cls: type[T], mapping: Any, where: str, apart: Collection[str] = ()) -> T:
     """An instance of dataclass `cls` from a mapping of its settings as plain YAML values, nested dataclasses as nested
-    mappings; those not named keep their defaults. `where` is the dotted place, for messages.
+    mappings; those not named keep their defaults. `where` is the dotted place, for messages. Keys that stand `apart`
+    are the caller's.
 
     Raises:
         InputError: an unknown key (naming the nearest), a missing one, a wrong type, or a value that the dataclass
@@ -45,12 +46,12 @@ def build_dataclass(cls: type[T], mapping: Any, where: str) -> T:
         raise InputError(f"{where}: a type of {cls.__name__}'s fields cannot be resolved: {error}") from error
     settings = settings_of(cls)
     for key in mapping:
-        if key not in settings:
-            raise InputError(f"unknown key '{where}.{key}': {nearest(key, settings)}")
+        if key not in settings and key not in apart:
+            raise InputError(f"unknown key '{where}.{key}': {nearest(key, [*settings, *apart])}")
     for name, field in settings.items():
         if name not in mapping and field.default is MISSING and field.default_factory is MISSING:
             raise InputError(f"{where}: key '{name}' is missing")
-    values = {key: convert(value, hints[key], f"{where}.{key}") for key, value in mapping.items()}
+    values = {key: convert(value, hints[key], f"{where}.{key}") for key, value in mapping.items() if key in settings}
     try:
         return cls(**values)
     except (ValueError, TypeError) as error:

@@ -65,12 +65,8 @@ class InPlace:
         self._others: list[Gaussians] = []
 
     def place(self, gaussians: Gaussians) -> Gaussians:
-        """Copy a model into this memory, over the one placed before, of which nothing is left. Every process must call
-        this, with models of one size, when no step is under way.
-
-        Returns:
-            The model there; the given one, where there is no such memory.
-        """
+        """Copy a model into this memory, over the one placed before, of which nothing is left, and return it; the given
+        one, where there is no such memory. Every process must call this, with models of one size, between steps."""
         starts = aligned_starts([value.numel() for _, value in gaussians.items()])
         if starts[-1] > self._model_room:
             if self._model is not None:
@@ -99,14 +95,8 @@ class InPlace:
         return self._others if gaussians is self._placed else None
 
     def prepare(self, engine: SharedEngine, shares: Sequence[Share], gaussians: int, device: torch.device) -> bool:
-        """Make room for a pass, which the engine keeps in this memory. Every process must call this.
-
-        Args:
-            gaussians: N.
-
-        Returns:
-            False: there is no such memory, for none of the processes, or engines do not keep passes there.
-        """
+        """Make room for a pass of N `gaussians`, which the engine keeps in this memory. Every process must call this.
+        Returns False where no process has such memory, or engines do not keep passes there."""
         slots = max(share.num_slots for share in shares)
         instances = max(len(share) for share in shares) * gaussians
         if slots > self._slots or instances > self._instances:
@@ -140,12 +130,8 @@ class InPlace:
         return memory
 
     def colors(self, engine: SharedEngine, shares: Sequence[Share], own: Tensor | None, seen: Tensor) -> Tensor:
-        """[P, 3] the colours of all samples.
-
-        Args:
-            own: [., 3] this process's, in the memory that its engine was lent; None if it has no samples.
-            seen: [2] int32, written: `SharedEngine.gather`.
-        """
+        """[P, 3] the colours of all samples. `own`: [., 3] this process's, in the memory that its engine was lent; None
+        if it has no samples. `seen`: [2] int32, written: `SharedEngine.gather`."""
         assert self._passes is not None, "prepare says that there is no memory"
         memory, lent = self._passes
         if self._ranks.asked:
@@ -165,8 +151,7 @@ class InPlace:
 
         Args:
             rows: what each process collects; the last one ends with N, the number of Gaussians.
-            own: of this process's views and all Gaussians, in the memory that its engine was lent; None if it has no
-                views.
+            own: of this process's views and all Gaussians, in the memory lent to its engine; None: it has no views.
             target: of all views and this process's rows; overwritten, but for records that are off screen.
         """
         assert self._passes is not None

@@ -49,10 +49,8 @@ class Messages:
         own: ScreenRecords | None,
         target: ScreenRecords,
     ) -> None:
-        """Send every process the records of its rows in this process's views, and put together what all send.
-
-        Arguments are as of `InPlace.collect`.
-        """
+        """Send every process the records of its rows in this process's views, and put together what all send. Arguments
+        as of `InPlace.collect`."""
         count = target.records.shape[1]
         sent = [torch.empty(0, device=target.records.device)] * len(rows)
         if own is not None:

@@ -59,11 +59,8 @@ Sharing = Callable[[ProcessRanks, int, torch.device], PeerMemory | None]
 
 
 def share_memory(ranks: ProcessRanks, size: int, device: torch.device) -> PeerMemory | None:
-    """Memory for `size` numbers of every process. Every process must call this, with one size.
-
-    Returns:
-        Zeros; or None on all of them, if one cannot have it.
-    """
+    """Memory for `size` numbers of every process, zeros; or None on all of them, if one cannot have it. Every process
+    must call this, with one size."""
     if device.type != "cuda":
         return None
     # Every process sees its own GPU alone, as number 0 (`processes.joined`). Torch would take that for one GPU of all.
@@ -82,10 +79,8 @@ def share_memory(ranks: ProcessRanks, size: int, device: torch.device) -> PeerMe
 
 
 def _steps(ranks: ProcessRanks, size: int) -> Iterator[PeerMemory]:
-    """Allocate this process's part; map all parts; prove that GPUs meet at a barrier in them.
-
-    It ends early where this process cannot have such memory.
-    """
+    """Allocate this process's part; map all parts; prove that GPUs meet at a barrier in them. Ends early where this
+    process cannot have such memory."""
     import torch.distributed._symmetric_memory as symmetric
 
     one_host = os.environ.get("LOCAL_WORLD_SIZE") == os.environ.get("WORLD_SIZE")
@@ -113,10 +108,8 @@ def _steps(ranks: ProcessRanks, size: int) -> Iterator[PeerMemory]:
 
 
 def _linked() -> bool:
-    """Whether this process's GPU has an NVLink that is up. True where the driver does not say.
-
-    Barriers need atomic operations in the other GPU's memory, which PCIe has not.
-    """
+    """Whether this process's GPU has an NVLink that is up; True where the driver does not say. Barriers need atomic
+    operations in the other GPU's memory, which PCIe has not."""
     name = f"GPU-{torch.cuda.get_device_properties(torch.cuda.current_device()).uuid}"
     command = ["nvidia-smi", "nvlink", "--status", "--id", name]
     try:

@@ -45,15 +45,13 @@ def restarts() -> int:
 
 
 def start(count: int, arguments: Sequence[str], device: str = "auto", module: str = "turbogs_plugin") -> int:
-    """Start `count` processes of the `turbogs` command on this machine, as torchrun does, and wait for them.
+    """Start `count` processes of the `turbogs` command on this machine, as torchrun does, and wait for them. Returns
+    the exit code: 0, or the code of the process that ended first with an error, which says itself why.
 
     Args:
         arguments: of the command.
         device: auto, cpu or cuda. On CPUs processes only share the work of tests.
         module: in the place of the command's.
-
-    Returns:
-        The exit code: 0, or the code of the process that ended first with an error, which says itself why.
 
     Raises:
         InputError: fewer GPUs answer.
@@ -88,13 +86,11 @@ def start(count: int, arguments: Sequence[str], device: str = "auto", module: st
 
 @contextmanager
 def joined(device: str) -> Iterator[Ranks]:
-    """While entered, this process belongs to those that train one model; `ONE` where it was started alone.
+    """While entered, this process belongs to those that train one model; `ONE` where it was started alone. With a GPU
+    (`device`: auto, cpu or cuda) it sees only its own.
 
     An error of one process ends all, and one of them says why: the process that it happened to, or the first one that
     misses another.
-
-    Args:
-        device: auto, cpu or cuda. With a GPU, the process sees only its own.
 
     Raises:
         InputError: there are fewer GPUs than processes on this machine, or the processes do not find each other.
@@ -148,8 +144,7 @@ def end_with_parent() -> None:
     """From now on this process is killed when its parent is gone, however that went. Linux only.
 
     The kernel does it, so it works where the main thread waits for a GPU or for another process. The signal is SIGKILL,
-    as SIGTERM would mean to save first, and that waits for processes which may be gone. Nothing is lost but the
-    iterations since the last checkpoint: files are written beside their place and renamed.
+    as SIGTERM would mean to save first, which waits for processes that may be gone.
 
     To be called in a thread that stays, as the kernel keeps the wish with the thread. It also takes the end of the
     *thread* that started this process for the parent's; launchers wait there for their processes. A parent that was

@@ -77,13 +77,8 @@ def _answered(method: Callable[..., Value]) -> Callable[..., Value]:
 
 
 class ProcessRanks(Ranks):
-    """The processes of torch's default group, which is initialised.
-
-    Tensors travel by the backend of their device: NCCL on GPUs, gloo on CPUs.
-
-    Attributes:
-        asked: number of the signal by which this process wants all to stop; 0: none.
-    """
+    """The processes of torch's default group. Tensors travel by the backend of their device: NCCL on GPUs, gloo on
+    CPUs. `asked`: number of the signal by which this process wants all to stop; 0: none."""
 
     def __init__(self) -> None:
         import torch.distributed as distributed
@@ -113,15 +108,8 @@ class ProcessRanks(Ranks):
 
     @_answered
     def exchange(self, sent: Sequence[Tensor], sizes: Sequence[int]) -> list[Tensor]:
-        """Send a flat float32 tensor to each process, this one included, and receive one from each.
-
-        Args:
-            sent: rank after rank, of any sizes.
-            sizes: of what each process sends to this one.
-
-        Returns:
-            Flat float32 tensors of these sizes, rank after rank, equal to the bit to what was sent.
-        """
+        """Send a flat float32 tensor to each process, rank after rank, this one included, and receive one from each,
+        equal to the bit. `sizes`: of what each process sends to this one."""
         received = sent[0].new_empty(sum(sizes))
         self._distributed.all_to_all_single(received, torch.cat(list(sent)), list(sizes), [len(part) for part in sent])
         return list(received.split(list(sizes)))
@@ -142,14 +130,8 @@ class ProcessRanks(Ranks):
 
 
 def require_equal(ranks: ProcessRanks, state: dict[str, Any]) -> None:
-    """Compare a state with the first process's, to the bit. Every process must call this.
-
-    Args:
-        state: nested dicts of tensors and numbers; ``iteration`` is among them.
-
-    Raises:
-        TrainingStopped: on all processes, where a tensor or a number of one differs.
-    """
+    """Compare a state, as of `Engine.verify`, with the first process's, to the bit. Every process must call this; all
+    raise `TrainingStopped` where a tensor or a number of one differs."""
     names, equal = [], []
     for name, value in leaves(state, "state"):
         if isinstance(value, Tensor | int | float):

@@ -159,13 +159,9 @@ class RanksEngine:
         self._exchange.stepped(gaussians)
 
     def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
-        if self._owned is None:
+        if self._owned is None or moments is None:
             return
         statistics = [] if stats is None else list(vars(stats).values())
-        if moments is None:
-            if statistics:
-                gather_rows(self.ranks, statistics)
-            return
         self._owned = None  # an event makes new tensors, beside which the old ones have no room
         tensors = [moments.exp_avg, moments.exp_avg_sq, moments.exp_avg_shN, moments.exp_avg_sq_shN, moments.steps]
         gather_rows(self.ranks, tensors + statistics)
@@ -183,15 +179,11 @@ class RanksEngine:
 
 @dataclass
 class Batch:
-    """What the processes render together in a step, and which share of the samples each has.
-
-    Args:
-        exchange: how colours and records go from process to process.
-    """
+    """What the processes render together in a step, and which share of the samples each has."""
 
     rank: int
     engine: SharedEngine
-    exchange: InPlace | Messages
+    exchange: InPlace | Messages  # of colours and records
     gaussians: Gaussians
     cameras: Cameras
     samples: PixelSamples
@@ -215,22 +207,19 @@ class SharedRendered(Rendered):
         plain = None
         if self._rendered is not None:
             slots = self.batch.shares[self.batch.rank].slots
-            parts: dict[str, Any] = {
-                name: None if value is None else value[slots] for name, value in vars(upstream).items()
-            }
-            plain = self._rendered.backward(**parts, with_statistics=with_statistics).plain()
+            own = {name: None if value is None else value[slots] for name, value in vars(upstream).items()}
+            plain = self._rendered.backward(**own, with_statistics=with_statistics).plain()
         return SharedScreen(self.batch, plain)
 
 
 @dataclass
 class SharedScreen(ScreenGradients):
-    """Gradients on the screen (`ScreenGradients`), each view's on the process that rendered it."""
+    """Gradients on the screen, each view's on the process that rendered it."""
 
     batch: Batch
     _plain: ScreenRecords | None
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
-        """`ScreenGradients.parameter_gradients`, of all views and Gaussians, on every process."""
         whole = self.whole()
         self.batch.exchange.stepped()
         return whole.parameter_gradients(rows, stats)
@@ -244,12 +233,7 @@ class SharedScreen(ScreenGradients):
         return self.of_rows([slice(0, len(gaussians))] * len(self.batch.shares), gaussians)
 
     def of_rows(self, rows: Sequence[slice], own: Gaussians) -> ScreenGradients:
-        """Gradients of all views, for some rows.
-
-        Args:
-            rows: what each process wants.
-            own: the Gaussians of this process's rows.
-        """
+        """Gradients of all views, for the rows that each process wants. `own`: the Gaussians of this process's rows."""
         batch, shape = self.batch, (len(self.batch.samples.view_ids), len(own))
         records = torch.empty(*shape, ScreenRecord.SIZE, device=own.device)
         radii = torch.empty(*shape, 2, dtype=torch.int32, device=own.device)
@@ -267,8 +251,7 @@ class OwnedRows:
 
     Attributes:
         rows: each process's.
-        gaussians, moments, stats: this process's rows, views of the tensors.
-        copies: of `gaussians`, in the other processes' models.
+        gaussians, moments, stats, copies: of this process's rows, views of the tensors.
     """
 
     def __init__(

@@ -81,17 +81,11 @@ def expose(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tenso
 def exposure_gradients(
     exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples
 ) -> tuple[Tensor, Tensor]:
-    """Gradients through `expose`.
-
-    A sample whose rendered colour is not finite has no part in the second.
-
-    Args:
-        colors: [P, 3], as given to `expose`.
-        gradients: [P, 3], d loss / d the exposed colours.
+    """Gradients through `expose` of colours [P, 3], from d loss / d the exposed colours [P, 3].
 
     Returns:
         [P, 3] float32, d loss / d colours: ``g + A^T g``; and [K, 3, 4] float64, d loss / d (A | b) of each view of the
-        batch, ``sum over its samples of g (c | 1)^T``.
+        batch, ``sum over its samples of g (c | 1)^T``, in which a colour that is not finite has no part.
     """
     colors, gradients = colors.detach().float(), gradients.float()
     maps = _of_slots(exposures, samples)

@@ -56,24 +56,14 @@ class Engine(Protocol):
 
     @abstractmethod
     def draw(self, rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate: float, step: Step) -> PixelSamples:
-        """Draw the samples of an iteration.
-
-        Args:
-            maps: of all views.
-            view_ids: K training views.
-            rate: r, the fraction of units to draw, above 0.
-            step: gives seed and iteration, which decide the random numbers, and the ages.
-        """
+        """Draw the samples of an iteration in K training views. `maps`: of all views; `rate`: r, the fraction of units
+        to draw, above 0; `step` gives the ages, and seed and iteration, which decide the random numbers."""
 
     @abstractmethod
     def render(
         self, gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, options: RenderOptions = DEFAULT_OPTIONS
     ) -> Rendered:
-        """Render samples of K views with gsplat's conventions.
-
-        Args:
-            cameras: the K views of the batch, in the order of `samples.view_ids`.
-        """
+        """Render samples of K views with gsplat's conventions. `cameras`: in the order of `samples.view_ids`."""
 
     @abstractmethod
     def evaluate(
@@ -115,17 +105,13 @@ class Engine(Protocol):
     def learn_exposures(
         self, exposures: Exposures, colors: Tensor, gradients: Tensor, samples: PixelSamples, rate: float
     ) -> Tensor:
-        """Take gradients back through `expose`, and make one step of Adam with the exposures of the batch, in place.
-
-        A skipped iteration (see `overflow`) changes no exposure.
+        """[P, 3] float32, d loss / d colours: takes gradients back through `expose`, and makes one step of Adam with
+        the exposures of the batch, in place. A skipped iteration (see `overflow`) changes no exposure.
 
         Args:
             colors: [P, 3], as given to `expose`.
             gradients: [P, 3], d loss / d exposed colours; it cannot be used again.
             rate: Adam's.
-
-        Returns:
-            [P, 3] float32, d loss / d colours.
         """
         of_colors, sums = exposure_gradients(exposures, colors, gradients, samples)
         step_exposures(exposures, sums, samples.view_ids, rate, self.overflow)
@@ -140,10 +126,9 @@ class Engine(Protocol):
         moments: GaussianMoments,
         stats: GaussianStats | None,
     ) -> None:
-        """Take gradients from the screen to the parameters, and make one step with them.
+        """Take gradients from the screen to the parameters, and make the rule's step with them.
 
         Args:
-            rule: which step.
             screen: from a backward pass of this engine; it cannot be used again.
             gaussians: the model that was rendered; changed in place, as is `moments`.
             stats: the statistics of density control, to which this pass is added; None if not needed.
@@ -171,10 +156,7 @@ class Engine(Protocol):
 
     def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
         """Make every row of the moments and the statistics valid, before they are read: after `update` some may not be.
-
-        Args:
-            moments: None where the statistics alone will be read, and more updates follow.
-        """
+        `moments`: None where the optimizer has no rule, so that `update` is never called."""
         return
 
     def agreed(self, update: RowUpdate | None) -> RowUpdate | None:

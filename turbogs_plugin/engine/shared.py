@@ -70,8 +70,7 @@ def collect_records(sources: Sequence[ScreenRecords], views: Sequence[int], targ
     their order.
 
     Args:
-        sources: of each process with views, in their order: of V views and N Gaussians; maybe other devices'
-            memory, read in place.
+        sources: of V views and N Gaussians, of each process with views; maybe other devices' memory, read in place.
         views: first view of each, in the batch: the last one of the process before, or the next.
         target: of K views and M Gaussians; overwritten, but where off screen an engine may leave what is there.
         row: first of the M among the N.
@@ -107,15 +106,13 @@ class SharedEngine(Engine):
     collect = staticmethod(collect_records)
 
     def lend(self, memory: PassMemory | None) -> bool:
-        """Let the following passes keep in this memory what it is for, as far as it fits in. None: in the engine's own.
-
-        Returns:
-            Whether they do. False here: no memory is kept from pass to pass.
-        """
+        """Let the following passes keep in this memory what it is for, as far as it fits in; None: in the engine's own.
+        Returns whether they do. False here: no memory is kept from pass to pass."""
         return False
 
     def gather(self, parts: Sequence[Tensor], first: int, counts: Sequence[int], seen: Tensor) -> Tensor:
-        """Put the colours of all processes together. If one has set `PassStatus.OVERFLOW`, so does `overflow` here.
+        """[P, 3] float32: the colours of one process after the other's, valid until the next call. If one has set
+        `PassStatus.OVERFLOW`, so does `overflow` here.
 
         Args:
             parts: [.] float32 of each process, memory that begins with the bits of its `PassStatus`; maybe other
@@ -123,9 +120,6 @@ class SharedEngine(Engine):
             first: number at which its colours begin, in each.
             counts: samples of each.
             seen: [2] int32, written: the largest `PassStatus.OVERFLOW` of all, and the largest `PassStatus.STOP`.
-
-        Returns:
-            [P, 3] float32, one process's after the other's; valid until the next call.
         """
         statuses = torch.stack([part[: PassStatus.SIZE].view(torch.int32) for part in parts])  # [processes, 3]
         seen.copy_(statuses[:, PassStatus.OVERFLOW :].amax(dim=0))
@@ -143,15 +137,9 @@ class SharedEngine(Engine):
         options: RenderOptions,
         plain: ScreenRecords,
     ) -> ScreenGradients:
-        """Screen gradients of K views from plain tensors, which several passes of engines of this kind gave.
-
-        Args:
-            gaussians: N Gaussians that were rendered, as they were then: all, or rows of them.
-            cameras, samples, options: of all K views, as the passes had them together.
-            plain: of these views and Gaussians.
-        """
+        """Screen gradients from plain tensors of K views and N Gaussians, which several passes of engines of this kind
+        gave. `gaussians`: as they were rendered, all or rows of them; the others: as the passes had them together."""
 
     def recover(self) -> None:
-        """Prepare to repeat iterations that were skipped because another process's memory was too small: waits for the
-        device, takes in what it learned of the memory needed, and clears `overflow`. Nothing here, where nothing is
-        kept."""
+        """Prepare to repeat iterations that were skipped because another process's memory was too small: wait for the
+        device, learn what memory is needed, and clear `overflow`. Nothing here, where nothing is kept."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
 from turbogs_plugin.config.scaling import with_iterations
+from turbogs_plugin.error_maps import LaggedCopy
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.density_swap import apply_row_update
 from turbogs_plugin.gsplat_bridge.host import (
@@ -42,13 +43,15 @@ from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, LossOutput, RowUpda
 _STEP = "app_opt pose_opt pose_noise with_eval3d antialiased random_bkgd sparse_grad visible_adam opacity_reg scale_reg"
 WITHOUT_EFFECT: dict[str, Any] = {**IN_IMAGES, **dict.fromkeys(_STEP.split(" "), False), "batch_size": 1}
 """Options of gsplat's trainer that change its own step alone, and the value that asks for nothing."""
+LAG = 16
+"""Steps after which a loss has reached the host. Trainers show it at every step, and would wait for the GPU there."""
 
 
 @dataclass(frozen=True)
 class StepInfo:
-    """What a step gives. The host waits for a GPU where a number is read, and nowhere else."""
+    """What a step gives. The host waits for a GPU where `psnr` is read, and nowhere else."""
 
-    loss: Tensor  # [] float32 of the samples, before the step's update
+    loss: Tensor  # [] float32 on the host, before the update; on a GPU that of a step 16 to 31 before
     num_gaussians: int  # after the step
     num_samples: int  # pixels of the step, empty slots among them
     _colors: Tensor
@@ -135,6 +138,7 @@ class TurboStep:
             mixed.host = {role_of(name, self.splats): self.optimizers[name] for name in rates}
             self.trainer.optimizer.learning_rates = mixed
         self.steps, self.max_steps, self._begun = 0, self.trainer.iterations, False
+        self._losses = LaggedCopy(torch.zeros(1, dtype=torch.float64, device=device), LAG)
 
     @staticmethod
     def proposed_steps(num_views: int, config: str = DEFAULT_CONFIG, overrides: Sequence[str] = ()) -> int:
@@ -159,7 +163,8 @@ class TurboStep:
             self._catch_up()
             trainer.conclude()
         output, colors, truth = trainer.seen
-        loss = output.loss.to(torch.float32, copy=True)  # an engine may use the memory of its own again
+        self._losses.source.copy_(output.loss)  # an engine may use the memory of its own again
+        loss = torch.tensor(self._losses.read()[0], dtype=torch.float32)
         return StepInfo(loss, len(trainer.gaussians), len(truth.samples), colors, truth)
 
     def state_dict(self) -> dict[str, Any]:
@@ -192,6 +197,7 @@ class TurboStep:
         except (KeyError, TypeError, IndexError, RuntimeError, ValueError) as error:
             raise InputError(f"the state does not fit this TurboStep: {error}") from None
         self.trainer.config.train.seed, self.steps, self._begun = state["seed"], state["steps"], True
+        self._losses.restart()
         before = len(self.splats["means"])
         for name in self.optimizers if before != count else ():
             self.optimizers[name].state.clear()

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from turbogs_plugin.config.configuration import Config
-from turbogs_plugin.errors import InputError
-from turbogs_plugin.report.tables import views_table
+from turbogs_plugin.errors import InputError, refusal
+from turbogs_plugin.files import write_text_atomically
+from turbogs_plugin.report.tables import short_table
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
+from turbogs_plugin.train.history import without_nan
 from turbogs_plugin.train.inputs import resolve_device
 from turbogs_plugin.train.look import Look, interpolated_exposures
 from turbogs_plugin.train.metrics import ImageError, evaluate
@@ -23,16 +26,24 @@ LPIPS_PACKAGES = ("torchvision", "torchmetrics")
 
 
 def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> str:
-    """Errors of a run's newest model, or of a given one (see `open_saved`), on each test view, as a table."""
+    """Errors of a run's newest model, or of a given one (see `open_saved`), on each test view, as a table. A run's
+    folder gets all of them as ``metrics.json``, too."""
     model, scene = open_saved(path, device_name, given)
     views, look = views_of(model, scene, "test")
     views = place_views(views, model.gaussians.device, model.config.train.pixels_place)
     lpips, reason = load_lpips(model.gaussians.device)
     metrics = evaluate(model.gaussians, views, look, lpips, refined=True)
-    note = f"\nLPIPS was not computed: {reason}" if reason else ""
+    mean, notes = metrics.mean, [f"LPIPS was not computed: {reason}"] if reason else []
+    if model.folder is not None:
+        end = {"iteration": model.iteration, "num_gaussians": len(model.gaussians), "fps": metrics.fps}
+        end |= {"mean": without_nan(mean), "views": [without_nan(view) for view in metrics.views]}
+        try:
+            write_text_atomically(model.folder.metrics, json.dumps(end, indent=1) + "\n")
+        except OSError as error:  # somebody else's run
+            notes.append(f"metrics.json was not written: {refusal(error)}")
     which = f"iteration {model.iteration}" if given is None else str(path)
-    speed = f"{len(model.gaussians)} Gaussians, {metrics.fps:.1f} views a second"
-    return f"{views_table(metrics, with_means=True)}\n\n{which}, {speed}{note}"
+    notes.insert(0, f"{which}, {len(model.gaussians)} Gaussians, {metrics.fps:.1f} views a second")
+    return "\n".join([short_table(metrics), "", *notes])
 
 
 def open_saved(path: Path, device_name: str, given: Config | None) -> tuple[SavedModel, Scene]:

@@ -33,9 +33,9 @@ def number(value: float, digits: int, absent: str = "not computed") -> str:
     return absent if math.isnan(value) else f"{value:.{digits}f}"
 
 
-def errors(measured: ViewMetrics | Evaluation, columns: Iterable[str] = ERRORS, psnr_digits: int = 2) -> list[str]:
+def errors(measured: ViewMetrics | Evaluation, columns: Iterable[str] = ERRORS) -> list[str]:
     """The values of some measures as cells of a table."""
-    return [number(getattr(measured, name), psnr_digits if "psnr" in name else 4) for name in columns]
+    return [number(getattr(measured, name), 2 if "psnr" in name else 4) for name in columns]
 
 
 def error_columns(metrics: Metrics) -> dict[str, str]:
@@ -47,25 +47,20 @@ def error_columns(metrics: Metrics) -> dict[str, str]:
     return ERRORS | {"lpips": "LPIPS (VGG)"} | further
 
 
-def views_table(metrics: Metrics, with_means: bool = False) -> str:
-    """A table with the errors of each test view, and with their means as its last line if asked for."""
+def views_table(metrics: Metrics) -> str:
+    """A table with the errors of each test view."""
     columns = error_columns(metrics)
-    rows = [[view.name, *errors(view, columns)] for view in metrics.views]
-    if with_means:
-        rows.append([metrics.mean.name, *errors(metrics.mean, columns, psnr_digits=4)])
-    return table(["view", *columns.values()], rows)
+    return table(["view", *columns.values()], [[view.name, *errors(view, columns)] for view in metrics.views])
 
 
-def history_table(history: list[Evaluation]) -> str:
-    """Error against seconds, for a terminal; and the end's errors by refined test cameras, where there are any."""
-    lines = [f"{'iteration':>9}  {'seconds':>8}  {'PSNR':>6}  {'SSIM':>6}  {'L1':>6}  {'Gaussians':>9}"]
-    for evaluation in history:
-        lines.append(
-            f"{evaluation.iteration:>9}  {evaluation.train_seconds:>8.1f}  {evaluation.psnr:>6.2f}  "
-            f"{evaluation.ssim:>6.4f}  {evaluation.l1:>6.4f}  {evaluation.num_gaussians:>9}"
-        )
-    if history and not math.isnan(history[-1].refined_l1):
-        last = history[-1]
-        refined = f"{last.refined_psnr:>6.2f}  {last.refined_ssim:>6.4f}  {last.refined_l1:>6.4f}"
-        lines.append(f"{'refined cameras':>19}  {refined}")
-    return "\n".join(lines)
+def short_table(metrics: Metrics) -> str:
+    """PSNR in dB, SSIM and, where it was computed, LPIPS, for a terminal: of each test view, then the means."""
+    mean, views = metrics.mean, [(view.name, view.psnr, view.ssim, view.lpips) for view in metrics.views]
+    for kind, said in FURTHER.items():
+        if not math.isnan(getattr(mean, f"{kind}_psnr")):
+            views.append((f"mean {said}", getattr(mean, f"{kind}_psnr"), getattr(mean, f"{kind}_ssim"), math.nan))
+    rows = [["view", "PSNR", "SSIM", *([] if math.isnan(mean.lpips) else ["LPIPS"])]]
+    for name, *values in (*views, (mean.name, mean.psnr, mean.ssim, mean.lpips)):
+        rows.append([name, *(number(value, digits, "") for value, digits in zip(values, (2, 4, 4), strict=True))])
+    width = max(len(row[0]) for row in rows)
+    return "\n".join(f"{row[0]:<{width}}" + "".join(f"  {cell:>6}" for cell in row[1 : len(rows[0])]) for row in rows)

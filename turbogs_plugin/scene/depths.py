@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.photos import pixel_offsets
-from turbogs_plugin.scene.scene import PosedImages
-from turbogs_plugin.types import PixelSamples
+from turbogs_plugin.scene.geometry import Observations
+from turbogs_plugin.types import Cameras, PixelSamples
 
 CELL = 4
 """Side in pixels of a cell, all of which has the depth of the point that the photo shows in it. On a surface turned
@@ -38,17 +37,20 @@ class InverseDepths:
     share: float
 
     @classmethod
-    def of(cls, views: PosedImages, points: Tensor, maps: Maps | None = None) -> InverseDepths:
-        """Depths of the points [M, 3] that photos show; of several in a cell the nearest; elsewhere what `maps` give.
+    def of(
+        cls, cameras: Cameras, shown: Observations | None, points: Tensor, maps: Maps | None = None
+    ) -> InverseDepths:
+        """Depths of the points [M, 3] where `shown` has them in photos of these cameras, of several in a cell the
+        nearest; elsewhere what `maps` give.
 
         Raises:
             InputError: no depth is known.
         """
-        shapes = -(-views.cameras.sizes // CELL)  # [V, 2]
-        starts = pixel_offsets(shapes)
+        shapes = -(-cameras.sizes // CELL)  # [V, 2]
+        starts = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))])
         cells = np.zeros(starts[-1], dtype=np.float32)
-        shown, places = views.observations, points.cpu().double().numpy()
-        viewmats, Ks = (getattr(views.cameras, name).cpu().double().numpy() for name in ("viewmats", "Ks"))
+        places = points.cpu().double().numpy()
+        viewmats, Ks = (getattr(cameras, name).cpu().double().numpy() for name in ("viewmats", "Ks"))
         for view, (width, height) in enumerate(shapes):
             own = cells[starts[view] : starts[view + 1]].reshape(height, width)
             if shown is not None:
@@ -56,7 +58,7 @@ class InverseDepths:
                 _tell(own, viewmats[view], Ks[view], places[shown.point_ids[rows]], shown.pixels[rows])
             if maps is not None and (given := maps(view, own)) is not None:
                 np.copyto(own, given, where=own == 0, casting="same_kind")
-        share = np.count_nonzero(cells) * CELL**2 / views.cameras.sizes.prod(axis=1).sum()
+        share = np.count_nonzero(cells) * CELL**2 / cameras.sizes.prod(axis=1).sum()
         if not share:
             raise InputError(
                 "loss.depth_weight: this capture does not say where photos show its points, nor has it depth maps: set "

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from turbogs_plugin.scene.depths import DepthPair
 from turbogs_plugin.types import BLACK, Color, PixelSamples
-
-if TYPE_CHECKING:
-    from turbogs_plugin.scene.depths import DepthPair
 
 PHOTO_BYTES = 3
 """Bytes of a pixel of an opaque photo; a transparent one has one more."""

@@ -4,34 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene.frame import Frame
+from turbogs_plugin.scene.geometry import Observations
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.types import Cameras
-
-
-@dataclass(frozen=True)
-class Observations:
-    """Places where V photos show points; the centre of a photo's first pixel is (0.5, 0.5)."""
-
-    pixels: np.ndarray  # [O, 2] float64
-    view_ids: np.ndarray  # [O] int64, ascending
-    point_ids: np.ndarray  # [O] int64
-
-    def __len__(self) -> int:
-        return len(self.pixels)
-
-    def of_views(self, views: np.ndarray, ratios: np.ndarray) -> Observations:
-        """The observations by some views ([W] int64, ascending), which become the first, second, ...; in pixels of
-        photos of another size, by the `ratios` [W, 2] of width and height."""
-        starts, ends = (np.searchsorted(self.view_ids, views, side) for side in ("left", "right"))
-        rows = np.concatenate([np.arange(*ends_of) for ends_of in zip(starts, ends, strict=True)] or [starts])
-        now = np.repeat(np.arange(len(views)), ends - starts)
-        return Observations(self.pixels[rows] * ratios[now], now, self.point_ids[rows])
 
 
 @dataclass

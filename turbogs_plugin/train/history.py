@@ -66,15 +66,16 @@ class Evaluation(FurtherErrors):
     skipped_updates: int = 0
     worst_psnr: float = math.nan
 
-    def to_json(self) -> str:
-        """One line; NaN is written as null."""
-        return json.dumps({name: None if value != value else value for name, value in asdict(self).items()})
+
+def without_nan(measured: FurtherErrors) -> dict[str, Any]:
+    """The fields of an evaluation or a view's errors for JSON, which has null for NaN."""
+    return {name: None if value != value else value for name, value in asdict(measured).items()}
 
 
 def append_evaluation(path: Path, evaluation: Evaluation) -> None:
     """Add one line to a history."""
     with naming(path), open(path, "a", opener=lambda name, flags: os.open(name, flags | os.O_NOFOLLOW, 0o666)) as file:
-        file.write(evaluation.to_json() + "\n")
+        file.write(json.dumps(without_nan(evaluation)) + "\n")
 
 
 def read_history(path: Path) -> list[Evaluation]:
@@ -99,5 +100,5 @@ def read_history(path: Path) -> list[Evaluation]:
 def rewind_history(path: Path, iteration: int) -> list[Evaluation]:
     """Drop the evaluations after this iteration, as a resumed run will make them again."""
     kept = [evaluation for evaluation in read_history(path) if evaluation.iteration <= iteration]
-    write_text_atomically(path, "".join(evaluation.to_json() + "\n" for evaluation in kept))
+    write_text_atomically(path, "".join(json.dumps(without_nan(evaluation)) + "\n" for evaluation in kept))
     return kept

@@ -24,7 +24,7 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.clock import WallClock
 from turbogs_plugin.train.history import rewind_history
-from turbogs_plugin.train.inputs import open_scene, open_started, require_device, resolve_device
+from turbogs_plugin.train.inputs import cpu_note, open_scene, open_started, require_device, resolve_device
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.pace import Pace, fitted_to_time
 from turbogs_plugin.train.run_files import RunFolder
@@ -115,9 +115,11 @@ def train(
             resolved, told = loop.trainer.config, [*scene.notes, plan.text()]
             if resolved.budget.time:
                 told.append(f"{resolved.budget.time} of training: about {resolved.train.iterations} iterations")
+            if device.type == "cpu":
+                told.append(cpu_note())
             print("\n".join(told), file=sys.stderr)
+            write_text_atomically(folder.asked, config.to_yaml())  # first: it tells a run that has begun
             write_text_atomically(folder.plan, plan.text() + "\n")
-            write_text_atomically(folder.asked, config.to_yaml())
             write_text_atomically(folder.config, resolved.to_yaml())
         return session.run(report, watch)
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from turbogs_plugin.config.configuration import Config, resolve_complete
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable, write_text_atomically
+from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.yaml_json import read_yaml
 
 
@@ -22,16 +24,23 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.asked, self.config, self.plan = path / "asked.yaml", path / "config.yaml", path / "plan.txt"
-        self.history, self.wall = path / "history.jsonl", path / "wall.json"
+        self.history, self.wall, self.metrics = path / "history.jsonl", path / "wall.json", path / "metrics.json"
         self.lock, self.owner = path / ".lock", path / ".owner"
         self.checkpoints, self.model, self.report = path / "checkpoints", path / "model.ply", path / "report.md"
         self.renders, self.tensorboard = path / "renders", path / "tensorboard"
+        self._begun = (self.asked, self.config, self.plan, self.history, self.checkpoints, self.tensorboard)
 
     def require_new(self) -> None:
-        """Raise `InputError` if the folder holds anything, or cannot be made."""
-        if self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir())):
+        """Raise `InputError` if the folder cannot be made, or holds more than a run without a checkpoint leaves."""
+        if self.path.exists() and not (self.path.is_dir() and self._unclaimed()):
             raise InputError(f"--out '{self.path}' is not empty: choose a new folder, or go on with a run by --resume")
         require_writable(self.path, f"--out '{self.path}'")
+
+    def _unclaimed(self) -> bool:
+        """Whether nothing is here but what a run leaves that ended before its first checkpoint."""
+        there = {*self.path.iterdir()} - {self.lock, self.owner}
+        begun = self.asked in there and there <= {*self._begun} and latest_checkpoint(self.checkpoints) is None
+        return begun or not there
 
     @contextmanager
     def owned(self, new: bool = False) -> Iterator[None]:
@@ -52,10 +61,12 @@ class RunFolder:
         except (OSError, NotImplementedError) as error:
             print(f"turbogs: '{self.path}' cannot be locked ({error}): let one process write to it", file=sys.stderr)
         try:
-            if new and {*self.path.iterdir()} - {self.lock, self.owner}:
+            if new and not self._unclaimed():
                 raise InputError(f"--out '{self.path}' is not empty: another process has written to it meanwhile")
             if before := read_text(self.owner):
                 print(f"turbogs: {before[:80]} was killed: '{self.path}' is taken over from it", file=sys.stderr)
+            if new:
+                self._clear()
             write_text_atomically(self.owner, f"process {os.getpid()} of {socket.gethostname()}")
             yield
         finally:
@@ -64,10 +75,18 @@ class RunFolder:
 
     def discard(self) -> None:
         """Remove what a run wrote that never came to a checkpoint, and the folder if nothing else is in it."""
-        for file in (self.asked, self.config, self.plan, self.history, self.owner, self.lock):
-            file.unlink(missing_ok=True)
-        if self.path.is_dir() and not any(self.path.iterdir()):
+        self._clear()
+        self.owner.unlink(missing_ok=True)
+        self.lock.unlink(missing_ok=True)
+        with suppress(OSError):  # there is something else
             self.path.rmdir()
+
+    def _clear(self) -> None:
+        for entry in self._begun:
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+            else:
+                entry.unlink(missing_ok=True)
 
     def finished(self, reported: bool) -> bool:
         """Whether the run's model, which is written at the end, is there, and its report if that is `reported`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import sys
@@ -213,6 +214,7 @@ class TrainingProgress(Listener):
         self._terminal = sys.stderr.isatty()
         self._began: tuple[int, float] | None = None  # the iteration and time of the first look
         self._next_refresh = 0.0
+        self._before = 0.0  # seconds of training before the first iteration
 
     def advanced(self, loop: TrainingLoop) -> None:
         now, trainer = time.perf_counter(), loop.trainer
@@ -227,13 +229,20 @@ class TrainingProgress(Listener):
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
         counts = {"non-finite losses": evaluation.nonfinite_losses, "skipped updates": evaluation.skipped_updates}
-        warning = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
-        total = loop.trainer.iterations
-        line = (
-            f"iteration {evaluation.iteration:>{len(str(total))}}/{total}  {evaluation.train_seconds:7.1f} s  test PSNR"
-            f" {evaluation.psnr:.2f} dB  SSIM {evaluation.ssim:.4f}  {evaluation.num_gaussians} Gaussians  {warning}"
+        further = [f"{count} {what}" for what, count in counts.items() if count]
+        iteration, total = evaluation.iteration, loop.trainer.iterations
+        if iteration == 0:
+            self._before = evaluation.train_seconds
+        elif iteration < total:
+            mean = (evaluation.train_seconds - self._before) / iteration
+            further.append(f"{mean * (total - iteration):,.0f} s left")
+        if not math.isnan(evaluation.refined_psnr):
+            further.append(f"by refined cameras {evaluation.refined_psnr:.2f} dB, {evaluation.refined_ssim:.4f}")
+        said = (
+            f"iteration {iteration:>{len(str(total))}}/{total}  {evaluation.train_seconds:7.1f} s  test PSNR"
+            f" {evaluation.psnr:.2f} dB  SSIM {evaluation.ssim:.4f}  {evaluation.num_gaussians} Gaussians"
         )
-        self._say(line.rstrip())
+        self._say("  ".join([said, *further]))
 
     def close(self) -> None:
         """Clear the terminal's line."""

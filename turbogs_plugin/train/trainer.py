@@ -58,7 +58,7 @@ class Trainer(TrainingState):
         self.depths: InverseDepths | None = None
         if self.loss.terms is not None and self.loss.terms.depth_weight > 0:
             maps = depth_maps(Path(config.scene.path), scene.train, scene.frame.scale)
-            self.depths = InverseDepths.of(scene.train, scene.points, maps).to(device)
+            self.depths = InverseDepths.of(scene.train.cameras, scene.train.observations, scene.points, maps).to(device)
         self.clearance: Clearance | None = None
         if config.train.camera_clearance and not scene.drawn_points:
             self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)

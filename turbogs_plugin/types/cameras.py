@@ -51,9 +51,6 @@ class Cameras:
 
         The selected cameras share memory with the present ones until their `viewmats` or `Ks` are read, which makes a
         copy. Where gradients flow to the present cameras, the copy is made at once.
-
-        Raises:
-            IndexError: a view that is not there.
         """
         own = range(len(self)) if self._rows is None else self._rows
         chosen = Cameras(self._viewmats, self._Ks, self.sizes[np.asarray(view_ids, dtype=np.int64)])

@@ -85,13 +85,6 @@ class GaussianGradients(ParameterTensors):
         value = getattr(self, name)
         return value if name == "shN" else value.sum(dim=0)
 
-    def over_views(self) -> GaussianGradients:
-        """The gradients with one row, the sum over views; itself if it has one row already."""
-        if len(self.means) == 1:
-            return self
-        sums = {name: value.sum(dim=0, keepdim=True) for name, value in vars(self).items()}
-        return replace(self, **(sums | {"shN": self.shN, "touched": self.touched}))
-
 
 @dataclass
 class GaussianStats:

@@ -137,13 +137,8 @@ class PixelSamples:
         return views, self.tile_offsets[1:].cpu().numpy().astype(np.int64)
 
     def of_tiles(self, tiles: slice, views: slice, slots: slice) -> PixelSamples:
-        """A run of tiles as a batch of its own, of the views that they lie in. Tensors are views of these ones.
-
-        Args:
-            tiles: positions in `tile_ids`.
-            views: positions in the batch of their views.
-            slots: the slots of these tiles.
-        """
+        """A run of tiles (positions in `tile_ids`) as a batch of its own, of the `views` that they lie in (positions in
+        the batch), with their `slots`. Tensors are views of these ones."""
         tile_offsets = self.tile_offsets[tiles.start : tiles.stop + 1]
         starts = self.grid.starts
         first = starts[views.start]
@@ -176,11 +171,8 @@ class PixelSamples:
         return self.view_of_tile()[self.tile_of_slot()]
 
     def flat_pixels(self, offsets: np.ndarray) -> Tensor:
-        """[P] int64: flat pixel of each slot; an empty slot gets the first pixel of its view.
-
-        Args:
-            offsets: [V + 1] int64, first flat pixel of each training view.
-        """
+        """[P] int64: flat pixel of each slot; an empty slot gets the first pixel of its view. `offsets`: [V + 1] int64,
+        first flat pixel of each training view."""
         starts = torch.as_tensor(offsets[list(self.view_ids)], device=self.pixel_ids.device)
         return starts[self.view_of_slot()] + self.pixel_ids.long().clamp(min=0)
 

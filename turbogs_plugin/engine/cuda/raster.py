@@ -101,13 +101,6 @@ class CudaScreenGradients(ScreenGradients):
         )
 
 
-def count_filled(samples: PixelSamples) -> Tensor | None:
-    """[1] int32 on the device: the number of filled slots; None if all are."""
-    if not samples.has_empty_slots:
-        return None
-    return (samples.pixel_ids >= 0).sum(dtype=torch.int32).reshape(1)
-
-
 @dataclass
 class CudaRendered(Rendered):
     """One forward pass (see `Rendered`). With a workspace, valid until the next pass."""
@@ -233,10 +226,8 @@ def rasterize_cuda(
     options: RenderOptions = DEFAULT_OPTIONS,
     workspace: Workspace | None = None,
 ) -> CudaRendered:
-    """`Engine.render`, on torch's current stream of the Gaussians' device.
-
-    Args:
-        workspace: memory to reuse, so that nothing waits for the GPU; `Workspace` says what the caller must then do.
+    """`Engine.render`, on torch's current stream of the Gaussians' device. `workspace`: memory to reuse, so that
+    nothing waits for the GPU; `Workspace` says what the caller must then do.
 
     Raises:
         InputError: cameras of other image sizes than the samples', or more intersections than a pass can have.

@@ -13,14 +13,13 @@ from collections.abc import Sequence
 from functools import lru_cache, partial
 from itertools import pairwise
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from turbogs_plugin.engine.cuda import launches, library
-from turbogs_plugin.engine.cuda.raster import Buffers, CudaScreenGradients, count_filled, plain_floats
+from turbogs_plugin.engine.cuda.raster import Buffers, CudaScreenGradients, plain_floats
 from turbogs_plugin.engine.cuda.workspace import Workspace
 from turbogs_plugin.engine.exposures import BETA1, BETA2, EPSILON, PULL, Exposures
 from turbogs_plugin.engine.layout import MAX_PEERS, SAMPLE_UNITS, STRUCTURES, UPDATE_KINDS
@@ -98,15 +97,12 @@ def sample_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], ra
 def _places(
     rule: DrawRule, host_ends: DrawEnds, tiles: tuple[int, ...], live_starts: tuple[int, ...]
 ) -> tuple[int, int, list[list[int]]]:
-    """Sizes of a draw, cached: a hundred iterations ask for equal ones, and making them takes longer than the launch.
+    """Sizes of a draw: the number of tiles that get samples, the number of their slots, and for each view the last six
+    numbers of its `layout.DrawRow`. Cached, as making them takes longer than the launch.
 
     Args:
         tiles: of each view, those that are not masked whole.
         live_starts: where each view's tiles stand among the unmasked ones; 0 without masks.
-
-    Returns:
-        The number of tiles that get samples; the number of their slots; for each view the last six numbers of its
-        `layout.DrawRow`.
     """
     view_ends, slot_ends = host_ends()
     firsts, starts = np.append(0, view_ends)[:-1], np.append(0, slot_ends)  # [K] tiles, [T + 1] slots
@@ -139,7 +135,7 @@ def sparse_loss(
     background: Color = BLACK,
     workspace: Workspace | None = None,
 ) -> LossOutput:
-    """`Engine.evaluate`, and with `update` `Engine.learn`, in one launch.
+    """`Engine.evaluate`, and with `update` `Engine.learn`, in one launch. The loss is a float64 scalar on the device.
 
     Args:
         colors: [P, 3] float32 or float16.
@@ -148,9 +144,6 @@ def sparse_loss(
         overflow: [1] int32 on the device, or None; if it is not 0, maps and count of `update` stay as they are.
         background: shows through photos that have an alpha.
         workspace: has memory for the gradients and errors, which are then valid until it is used for the next loss.
-
-    Returns:
-        The loss is a float64 scalar on the device, gradients and errors are float32.
     """
     colors = plain_floats(colors)
     photos = targets if targets.dtype == torch.uint8 else None
@@ -179,7 +172,7 @@ def sparse_loss(
         maps=maps,
         beta=beta,
         stamp=stamp,
-        num_filled=count_filled(samples),
+        num_filled=samples.filled.sum(dtype=torch.int32).reshape(1) if samples.has_empty_slots else None,
         output=output,
         nonfinite_losses=nonfinite_losses,
         overflow=overflow,
@@ -202,13 +195,8 @@ def fused_step(
     copies: ModelCopies | None = None,
 ) -> None:
     """Projection backward and one step of `rule` in one launch: changes `gaussians`, `copies` and `moments`, adds to
-    `stats`, and leaves nothing of use in `screen.records`.
-
-    Args:
-        screen: of a backward pass of this engine.
-        gaussians: the model that `screen` was made from: float32, contiguous.
-        moments: its optimizer state, float32.
-        copies: of `gaussians`, `MAX_PEERS` - 1 at most.
+    `stats`, and leaves nothing of use in `screen.records`. `gaussians` are those that `screen` was made from, float32
+    and contiguous; there are at most `MAX_PEERS` - 1 copies.
     """
     if not isinstance(screen, CudaScreenGradients):
         raise TypeError(f"fused_step: {type(screen).__name__} is not of a pass of the kernels")
@@ -241,12 +229,9 @@ def _copies(copies: ModelCopies | None) -> SimpleNamespace:
 
 def expose_colors(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> Tensor:
     """`Engine.expose`."""
-    launch = launches.ExposeColors(
-        **_exposed(exposures, plain_floats(colors), samples),
-        exposed=torch.empty(len(colors), 3, device=colors.device),
-    )
-    library.launch(launch)
-    return launch.exposed
+    exposed = torch.empty(len(colors), 3, device=colors.device)
+    library.launch(launches.ExposeColors(_exposed_views(exposures, colors, samples), exposed))
+    return exposed
 
 
 def learn_exposures(
@@ -258,25 +243,20 @@ def learn_exposures(
     overflow: Tensor | None = None,
 ) -> Tensor:
     """`Engine.learn_exposures`, in two launches; `gradients`, where float32 and contiguous, is changed in place."""
-    exposed = _exposed(exposures, plain_floats(colors), samples)
-    backward = launches.ExposureBackward(
-        **exposed,
-        gradients=plain_floats(gradients),
-        sums=torch.zeros(len(samples.view_ids), 3, 4, dtype=torch.float64, device=colors.device),
-    )
-    library.launch(backward)
+    batch, gradients = _exposed_views(exposures, colors, samples), plain_floats(gradients)
+    sums = torch.zeros(len(samples.view_ids), 3, 4, dtype=torch.float64, device=colors.device)
+    library.launch(launches.ExposureBackward(batch, gradients, sums))
     adam = {"rate": rate, "beta1": BETA1, "beta2": BETA2, "eps": EPSILON, "pull": PULL}
-    library.launch(launches.ExposureStep(backward.sums, backward.views, backward.grid, exposures, overflow, **adam))
-    return backward.gradients
+    library.launch(launches.ExposureStep(sums, batch.views, batch.grid, exposures, overflow, **adam))
+    return gradients
 
 
-def _exposed(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> dict[str, Any]:
-    """Arguments of `launches.ExposedViews`. `colors`: [P, 3] float32, contiguous."""
-    return {
-        "colors": colors,
-        "tile_ids": samples.tile_ids,
-        "tile_offsets": samples.tile_offsets,
-        "views": view_rows([0] * len(samples.view_ids), samples.sizes.tolist(), samples.view_ids),
-        "grid": launches.GridOrigin(*samples.origin),
-        "offsets": exposures.offsets,
-    }
+def _exposed_views(exposures: Exposures, colors: Tensor, samples: PixelSamples) -> launches.ExposedViews:
+    return launches.ExposedViews(
+        colors=plain_floats(colors),
+        tile_ids=samples.tile_ids,
+        tile_offsets=samples.tile_offsets,
+        views=view_rows([0] * len(samples.view_ids), samples.sizes.tolist(), samples.view_ids),
+        grid=launches.GridOrigin(*samples.origin),
+        offsets=exposures.offsets,
+    )

@@ -56,11 +56,7 @@ def round_capacity(intersections: float) -> int:
 
 
 def require_possible(intersections: int) -> None:
-    """Refuse a pass of more intersections than one can have.
-
-    Raises:
-        InputError: no memory would suffice.
-    """
+    """Raise `InputError` for a pass of more intersections than one can have: no memory would suffice."""
     if intersections > MAX_CAPACITY:
         raise InputError(
             f"a pass takes at most {MAX_CAPACITY} intersections of tiles and splats: take fewer views or tiles"
@@ -123,12 +119,8 @@ class Workspace:
         return view
 
     def lend(self, memory: PassMemory | None) -> None:
-        """Let the status and some buffers lie in memory of the caller; the buffers until they outgrow it.
-
-        Call it before every pass that shall use the memory: a larger pass between may have replaced it.
-
-        Args:
-            memory: None: all are the workspace's own again.
+        """Let the status and some buffers lie in memory of the caller, the buffers until they outgrow it; None: all are
+        the workspace's own again. To be called before every pass that shall use it: a larger one may have replaced it.
         """
         lent = {} if memory is None else {name: getattr(memory, name) for name in LENT}
         if memory is self._lent and all(self._buffers.get(name) is value for name, value in lent.items()):
@@ -143,11 +135,8 @@ class Workspace:
         self._lent = memory
 
     def kept(self, name: str, sizes: tuple, make: Callable[[], Kept]) -> Kept:
-        """Result of `make`, made anew only where `sizes` differ from the last call of this name.
-
-        For arguments of launches that are buffers of these sizes: they are the same for a hundred passes, and to put
-        them together anew takes the host as long as to enqueue the launches.
-        """
+        """Result of `make`, arguments of launches that are buffers of these `sizes`; made anew only where these differ
+        from the last call of this name. To put them together takes the host as long as to enqueue the launches."""
         last = self._kept.get(name)
         if last is None or last[0] != sizes:
             self._kept.pop(name, None)  # lets go of the buffers that grow
@@ -162,11 +151,8 @@ class Workspace:
         return self._zeros.pop()
 
     def capacity(self, gaussians: int, tiles: int) -> int | None:
-        """Number of intersections that a pass gets memory for, or None if nothing is known yet.
-
-        Passes may go on after a loss, and draw nothing until `take_lost`: several processes agree on it some passes
-        later.
-        """
+        """Number of intersections that a pass gets memory for, or None if nothing is known yet. Passes may go on after
+        a loss, and draw nothing until `take_lost`: several processes agree on it some passes later."""
         if gaussians != self._gaussians:
             self._intersections_per_tile *= gaussians / self._gaussians if self._gaussians else 0.0
             self._gaussians = gaussians
@@ -176,19 +162,14 @@ class Workspace:
         return min(round_capacity(margin * self._intersections_per_tile * tiles), MAX_CAPACITY)
 
     def learn(self, intersections: int, tiles: int) -> None:
-        """Take in the true count of a pass.
-
-        Raises:
-            InputError: more than a pass can have.
-        """
+        """Take in the true count of a pass. Raises as `require_possible`."""
         require_possible(intersections)
         self._intersections_per_tile = max(self._intersections_per_tile * FORGETTING, intersections / max(1, tiles))
 
     def send_count(self, tiles: int) -> None:
         """Send the count of the pass just enqueued to the host, without waiting."""
         if len(self._pending) == PENDING_MAX:
-            self._pending[0].event.synchronize()
-            self.poll()
+            self.poll(wait_for=0)
         place = self.passes % PENDING_MAX
         if place not in self._events:
             self._events[place] = torch.cuda.Event()
@@ -198,12 +179,11 @@ class Workspace:
         self._pending.append(_Pending(self.passes, tiles, event, values))
         self.passes += 1
 
-    def poll(self) -> None:
-        """Take in the counts that have arrived.
-
-        Raises:
-            InputError: a pass had more intersections than a pass can have; it drew nothing.
-        """
+    def poll(self, wait_for: int | None = None) -> None:
+        """Take in the counts that have arrived; they do so in the order of the passes. Raises as `require_possible`.
+        `wait_for`: place, among those under way, of a count to wait for."""
+        if wait_for is not None and self._pending:
+            self._pending[wait_for].event.synchronize()
         while self._pending and self._pending[0].event.query():
             arrived = self._pending.popleft()
             intersections, flag = arrived.values.tolist()
@@ -211,29 +191,19 @@ class Workspace:
                 self._first_lost = arrived.number
             self.learn(intersections, arrived.tiles)
 
-    def _wait(self) -> None:
-        """Wait for every count under way and take it in. They arrive in the order of the passes."""
-        if self._pending:
-            self._pending[-1].event.synchronize()
-            self.poll()
-
     def take_lost(self, wait: bool = False) -> int:
-        """Number of the latest passes that did nothing and must be repeated. Clears the flag; the repetition will fit.
+        """Number of the latest passes that did nothing and must be repeated. Clears the flag; the repetition will fit,
+        or this raises as `require_possible`.
 
         Args:
             wait: wait for every count under way, as at the end of training; else only arrived ones are looked at.
-
-        Raises:
-            InputError: a pass had more intersections than a pass can have: repeating it is no use.
         """
-        if wait:
-            self._wait()
-        self.poll()
+        self.poll(wait_for=-1 if wait else None)
         if self._first_lost is None:
             return 0
         lost = self.passes - self._first_lost
         # The counts still under way belong to lost passes; they are true, so the repetition will fit.
-        self._wait()
+        self.poll(wait_for=-1)
         self._first_lost = None
         self.status.zero_()
         return lost

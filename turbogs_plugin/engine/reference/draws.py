@@ -41,7 +41,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -59,53 +59,42 @@ WEIGHT_FLOOR = 2.0**-100
 """Weight of a unit without error: so small that it never wins against a positive one."""
 
 
-@dataclass(frozen=True)
-class Units:
-    """The units of a draw: R rows of U units; each row is a draw of its own.
+def draw_units(
+    errors: Tensor, ages: Tensor, exist: Tensor, words: Words, wanted: int, rule: DrawRule
+) -> tuple[Tensor, Tensor | None]:
+    """Draw from each of R rows of U units, in the three stages of the module docstring.
 
     Args:
-        errors: [R, U] float64, exact sums; 0 where there is no unit.
-        ages: [R, U] integers; 0 where there is no unit.
+        errors, ages: [R, U] float64, exact sums, and integers; 0 where there is no unit.
         exist: [R, U] bool, there is a unit: rows of tiles cut by the image's edge have gaps.
         words: four [R, U] int64 random words.
         wanted: units to draw from each row.
-    """
-
-    errors: Tensor
-    ages: Tensor
-    exist: Tensor
-    words: Words
-    wanted: int
-
-
-def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
-    """Draw from each row, in the three stages of the module docstring.
 
     Returns:
         [R, U] bool, the units drawn; and their inclusion probabilities p, [R, U] float32 (meaningless for units not
         drawn), or None if the rule has no importance weights.
     """
-    ranks = (1 << RANK_BITS) - 1 - torch.arange(units.exist.shape[1], device=units.errors.device)  # [U]
-    errors, ages = units.errors.float(), units.ages.long()
+    ranks = (1 << RANK_BITS) - 1 - torch.arange(exist.shape[1], device=errors.device)  # [U]
+    ages, sums = ages.long(), errors.sum(dim=1, keepdim=True).float()
+    errors = errors.float()
     if rule.mixed_uniform:
         mixed = torch.ones_like(errors)
     else:
-        error_sums, age_sums = units.errors.sum(dim=1, keepdim=True), ages.sum(dim=1, keepdim=True)
-        mixed = _share(errors, error_sums.float()) + _share(ages.float(), age_sums.float())
+        mixed = _share(errors, sums) + _share(ages.float(), ages.sum(dim=1, keepdim=True).float())
 
-    drawn = torch.zeros_like(units.exist)
+    drawn = torch.zeros_like(exist)
     missed = torch.ones_like(errors)  # probability of not being drawn
     weights_of = {"hard": errors, "mixed": mixed}  # the stable stage goes by age alone
     stages = ("hard", "stable", "mixed")
-    for stage, count, words in zip(stages, rule.stages(units.wanted), units.words[:3], strict=True):
+    for stage, count, word in zip(stages, rule.stages(wanted), words[:3], strict=True):
         if count == 0:
             continue
         if stage == "stable":
-            primary = (ages << AGE_TIE_BITS) | (words >> (32 - AGE_TIE_BITS))
+            primary = (ages << AGE_TIE_BITS) | (word >> (32 - AGE_TIE_BITS))
         else:
             weights = weights_of[stage].clamp(min=WEIGHT_FLOOR)
-            primary = (weights / exponentials(words)).view(torch.int32).long()
-        keys = torch.where(units.exist & ~drawn, (primary << RANK_BITS) | ranks, -1)
+            primary = (weights / exponentials(word)).view(torch.int32).long()
+        keys = torch.where(exist & ~drawn, (primary << RANK_BITS) | ranks, -1)
         largest = keys.topk(min(count + 1, keys.shape[1]), dim=1).values
         largest = torch.nn.functional.pad(largest, (0, 1), value=-1)  # a stage may take all there are
         smallest_taken, largest_left = largest[:, count - 1, None], largest[:, count, None]
@@ -121,7 +110,7 @@ def draw_units(units: Units, rule: DrawRule) -> tuple[Tensor, Tensor | None]:
             missed = missed * (1.0 - chance)
     if not rule.importance:
         return drawn, None
-    complete = (drawn | ~units.exist).all(dim=1, keepdim=True)
+    complete = (drawn | ~exist).all(dim=1, keepdim=True)
     return drawn, torch.where(complete, 1.0, 1.0 - missed)
 
 
@@ -166,7 +155,7 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
         tile_ids = chosen if tile_ids is None else tile_ids[chosen]
     else:
         wanted = [rule.wanted(rate, TILE_PIXELS)] * len(counts)
-        drawn, probabilities = draw_units(Units(errors, ages, exist, words(table, PURPOSE_PIXELS), wanted[0]), rule)
+        drawn, probabilities = draw_units(errors, ages, exist, words(table, PURPOSE_PIXELS), wanted[0], rule)
         weights = None if probabilities is None else probabilities.clamp(min=2.0**-24) ** -rule.importance
         slots = np.minimum(wanted[0], tile_areas(sizes)) if live is None else np.full(len(table), wanted[0])
         tile_ids = torch.arange(len(table), device=device) if tile_ids is None else tile_ids
@@ -196,7 +185,7 @@ def _draw_tiles(
         numbers.append(wanted)
         exist = torch.ones(1, end - first, dtype=torch.bool, device=device)
         x0, x1, x2, x3 = (word[row].T for word in of_tiles)
-        drawn, _ = draw_units(Units(errors[None, row], ages[None, row], exist, (x0, x1, x2, x3), wanted), rule)
+        drawn, _ = draw_units(errors[None, row], ages[None, row], exist, (x0, x1, x2, x3), wanted, rule)
         # Their number is known here; a boolean index would wait for the device.
         tile_ids = torch.argsort(drawn[0].to(torch.int8), stable=True, descending=True)[:wanted]
         chosen.append(first + tile_ids)

@@ -38,7 +38,7 @@ def sparse_loss(
         f = lambda where `LossTerms.balance`, else 1
         lambda = clip(mean |grad l1| / (mean |grad S| + 1e-8), 0, 1)
 
-    l1 is the Charbonnier term of `_Problem`, S the similarity named by `structure`. ``grad l1`` is
+    l1 is the Charbonnier term of `Problem`, S the similarity named by `structure`. ``grad l1`` is
     ``d / sqrt(d^2 + eps^2)`` and ``grad S`` is g, the gradients that the appendix prints. lambda takes their L1 norms
     over channels, and means over the tile's samples (by their shares). Both gradients lack 1 / n, so the two terms
     compare as they enter L. lambda is constant in the backward pass.
@@ -48,7 +48,7 @@ def sparse_loss(
         colors, targets: [P, 3].
         samples: the P slots.
     """
-    problem = _Problem(colors, targets, samples, terms.epsilon)
+    problem = Problem(colors, targets, samples, terms.epsilon)
     loss, gradients, depth_gradients = terms.l1_weight * problem.loss, terms.l1_weight * problem.gradients, None
     if depths is not None:
         of_depth, depth_gradients = depth_loss(terms, depths, samples)
@@ -90,7 +90,7 @@ def depth_loss(terms: LossTerms, depths: DepthPair, samples: PixelSamples) -> tu
     return loss, -weights * slopes * inverse * inverse
 
 
-def tile_moments(problem: _Problem) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def tile_moments(problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Second moments of prediction (x) and truth (y) of each tile and channel.
 
     Two passes, relative to the tile's first sample, so a constant tile has variance 0 exactly.
@@ -112,7 +112,7 @@ Similarity = tuple[Tensor, Tensor]
 """Similarity S of each tile and channel, [T, C], at most 1; and g, [P, C], with d S / d x = omega * g."""
 
 
-def correlation(problem: _Problem, constant: float) -> Similarity:
+def correlation(problem: Problem, constant: float) -> Similarity:
     """NCC with a variance floor f = constant / 2, the structure term of SSIM::
 
         S = (s_xy + f) / sqrt((s_x^2 + f) (s_y^2 + f))
@@ -129,7 +129,7 @@ def correlation(problem: _Problem, constant: float) -> Similarity:
     return similarity, offset_y * spread(slope_y) - offset_x * spread(slope_x)
 
 
-def printed_correlation(problem: _Problem, constant: float) -> Similarity:
+def printed_correlation(problem: Problem, constant: float) -> Similarity:
     """NCC and its gradient as the appendix prints them, with epsilon = constant::
 
         S = s_xy / sqrt(s_x^2 s_y^2 + epsilon)
@@ -145,15 +145,14 @@ def printed_correlation(problem: _Problem, constant: float) -> Similarity:
     return similarity, offset_y * spread(1.0 / scale) - offset_x * spread(slope_x)
 
 
-def ssim(problem: _Problem, constant: float) -> Similarity:
+def ssim(problem: Problem, constant: float) -> Similarity:
     """The mean SSIM of the samples of a tile, in windows, with SSIM's own constants, whatever `constant` is; see
     `window_similarity`."""
-    groups = problem.groups
-    similarity, slopes = window_similarity(problem.colors, problem.targets, problem.samples, groups)
-    return 1.0 - groups.mean(1.0 - similarity), slopes
+    similarity, slopes = window_similarity(problem)
+    return 1.0 - problem.groups.mean(1.0 - similarity), slopes
 
 
-SIMILARITIES: dict[str, Callable[[_Problem, float], Similarity]] = {
+SIMILARITIES: dict[str, Callable[[Problem, float], Similarity]] = {
     "ncc": correlation,
     "ssim": ssim,
     "printed_ncc": printed_correlation,
@@ -161,7 +160,7 @@ SIMILARITIES: dict[str, Callable[[_Problem, float], Similarity]] = {
 """Name of a structure term -> its definition. `strategies.losses` uses the same names."""
 
 
-class _Problem:
+class Problem:
     """Start of every loss: inputs in the precision of the computation, and the Charbonnier term.
 
     The term is ``mean over filled samples of w * mean over channels of (sqrt(d^2 + eps^2) - eps)``, d = x - y. It is
@@ -221,10 +220,8 @@ class TileGroups:
         return values[self.tile_of_slot]
 
 
-def window_similarity(
-    colors: Tensor, targets: Tensor, samples: PixelSamples, groups: TileGroups
-) -> tuple[Tensor, Tensor]:
-    """SSIM of every sample, and what it gives to the gradient.
+def window_similarity(problem: Problem) -> tuple[Tensor, Tensor]:
+    """SSIM S of every sample, and h, what it gives to the gradient: [P, 3] each. In a tile, each pixel at most once.
 
     The window of sample i has the weights ``w_j g(i - j)`` over the samples j of its tile, over their sum n_i, with g a
     Gaussian of `WINDOW_SIGMA` pixels that ends after `WINDOW_RADIUS` pixels along each axis. Means, variances and
@@ -242,15 +239,8 @@ def window_similarity(
     And c is SSIM's c2 plus the mean squares' rounding: where that is larger, a window that seems to have no variance
     would else have the slope of a flat one, times what rounding makes of colours of thousands. The gradient ignores
     both.
-
-    Args:
-        colors, targets: [P, 3], 0 where the weight is 0.
-        samples: the P slots. In a tile, each pixel at most once.
-        groups: of these samples, with w.
-
-    Returns:
-        S and h, [P, 3] each.
     """
+    samples, groups, colors, targets = problem.samples, problem.groups, problem.colors, problem.targets
     inside = (samples.coordinates() + torch.tensor(samples.origin, device=samples.pixel_ids.device)) % TILE_SIZE
     # [P] the place of each slot among the pixels of all T tiles, row by row in a tile; in empty slots any
     places = (groups.tile_of_slot * TILE_SIZE + inside[:, 1]) * TILE_SIZE + inside[:, 0]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from .base import LAUNCHES, Launch, field_types, fields_of, nested_type
+from .base import LAUNCHES, Launch, fields_of, nested_type
 
 if TYPE_CHECKING:
     from types import SimpleNamespace as Copies
@@ -55,7 +55,7 @@ else:  # the fields that launches read of these
     ErrorMaps = fields_of(Tensor="errors stamps view_sums")  # [X] float16, [X] int16, [V] float64
     Exposures = fields_of(Tensor="offsets exp_avg exp_avg_sq steps")
 
-__all__ = ["LAUNCHES", "Launch", "field_types", "nested_type"]
+__all__ = ["LAUNCHES", "Launch", "nested_type"]
 
 NO_COPIES: Any = SimpleNamespace(**dict.fromkeys(Copies.__annotations__, 0))
 NO_STATS: Any = SimpleNamespace(**dict.fromkeys(GaussianStats.__annotations__))
@@ -291,15 +291,18 @@ class ExposedViews:
 
 
 @dataclass
-class ExposeColors(ExposedViews, Launch):
+class ExposeColors(Launch):
     """Map the colours by the exposures: writes `exposed`."""
 
+    batch: ExposedViews
     exposed: Tensor  # [P, 3] float32
 
 
 @dataclass
-class ExposureBackward(ExposedViews, Launch):
+class ExposureBackward(Launch):
     """Gradients through `ExposeColors`: changes `gradients` in place, adds to `sums`."""
+
+    batch: ExposedViews
 
     gradients: Tensor  # [P, 3] float32
     sums: Tensor  # [K, 3, 4] float64, zero
@@ -330,9 +333,7 @@ class CollectRecords(Launch):
     target_radii: Tensor  # [K, M, 2] int32
     first_views: list[int]  # [sources] of the batch; a process begins with the last view of the one before, or the next
     first_row: int  # of the sources
-    sources: list[
-        Tensor
-    ]  # records and radii of each process with views, as of N Gaussians; maybe in other GPUs' memory
+    sources: list[Tensor]  # records and radii of each process with views, of N Gaussians; maybe in other GPUs' memory
 
 
 @dataclass
@@ -344,6 +345,4 @@ class GatherColors(Launch):
     first: int  # number at which colours begin, in each process's memory
     seen: Tensor  # [2] int32: the largest of two flags
     overflow: Tensor | None  # [1] int32, set like the first of these
-    peers: list[
-        Tensor
-    ]  # [.] float32 of each process: memory, maybe another GPU's, that begins with a layout.PassStatus
+    peers: list[Tensor]  # [.] float32 of each process: maybe another GPU's memory; a layout.PassStatus comes first

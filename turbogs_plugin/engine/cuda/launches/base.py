@@ -32,7 +32,7 @@ class Launch:
         cls.operator = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
         cls.paths = _paths(cls)
         tensors, integers, reals = map(_reader, cls.paths[:3])
-        for name in (name for name, kind in field_types(cls).items() if kind == "list[Tensor]"):
+        for name in (name for name, kind in cls.__annotations__.items() if kind == "list[Tensor]"):
             tensors = _joined(tensors, attrgetter(name))
         rows = cls.paths[3]
         cls._readers = tensors, integers, reals, attrgetter(*rows) if rows else _reader(rows)
@@ -51,12 +51,6 @@ def fields_of(**kinds: str) -> type:
     )
 
 
-def field_types(cls: type) -> dict[str, str]:
-    """Name -> type of the fields of a class, bases first."""
-    own = (vars(base).get("__annotations__", {}) for base in reversed(cls.__mro__) if base is not Launch)
-    return dict(field for fields in own for field in fields.items())
-
-
 def nested_type(cls: type, annotation: str) -> type:
     """The class that an annotation of this class's file names."""
     return getattr(sys.modules[cls.__module__], annotation)
@@ -65,7 +59,7 @@ def nested_type(cls: type, annotation: str) -> type:
 def _paths(cls: type, prefix: str = "") -> tuple[list[str], list[str], list[str], list[str]]:
     """Dotted paths of the tensors, integers, reals and rows of a class, in the order of its fields."""
     paths: tuple[list[str], list[str], list[str], list[str]] = ([], [], [], [])
-    for name, annotation in field_types(cls).items():
+    for name, annotation in cls.__annotations__.items():
         if annotation in KINDS:
             paths[KINDS[annotation]].append(prefix + name)
         elif annotation != "list[Tensor]":
