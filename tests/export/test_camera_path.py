@@ -9,12 +9,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.export.camera_path import focus_and_up, from_file, interpolated, orbit, through_views
+from turbogs_plugin.export.camera_path import from_file, interpolated, orbit, through_views
 from turbogs_plugin.model.placement import TRANSFORMS, TURNS
 from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.scene.geometry import look_at
 from turbogs_plugin.types import Cameras
+from turbogs_plugin.viewer.camera import focus_and_up
 
 K = np.array([[50.0, 0, 24], [0, 50.0, 20], [0, 0, 1]])
 UP = np.array([0.0, 0.0, 1.0])

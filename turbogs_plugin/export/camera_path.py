@@ -18,6 +18,7 @@ from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.geometry import camera_centers, evenly, look_at, seen
 from turbogs_plugin.types import Cameras
+from turbogs_plugin.viewer.camera import focus_and_up
 from turbogs_plugin.yaml_json import parse_json
 
 MOST_KEYS = 24
@@ -26,21 +27,6 @@ SWING = math.pi
 """Largest gap in radians between cameras that surround what they look at; beyond it an orbit swings."""
 WIDEST_FILM = 1920
 """Pixels of the longer side of a film from the capture's cameras; a file's cameras have their own size."""
-
-
-def focus_and_up(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """The point nearest to all lines of sight (least squares), [3], and the mean upward direction, [3], a unit vector.
-    Where the lines are parallel, or meet behind the cameras, the point is one unit in front of their mean."""
-    centers, directions = (value.double().cpu().numpy() for value in (cameras.centers, cameras.directions))
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # [C, 3, 3]
-    matrix = across.mean(axis=0)
-    point = centers.mean(axis=0) + _unit(directions.mean(axis=0), np.array([0.0, 0.0, 1.0]))
-    if np.linalg.eigvalsh(matrix)[0] > 1e-3:
-        nearest = np.linalg.solve(matrix, np.einsum("cij,cj->i", across, centers) / len(centers))
-        if np.median(((nearest - centers) * directions).sum(axis=1)) > 0:
-            point = nearest
-    down = cameras.viewmats[:, 1, :3].double().cpu().numpy().mean(axis=0)
-    return point, _unit(-down, np.array([0.0, -1.0, 0.0]))
 
 
 def orbit(cameras: Cameras, frames: int) -> Cameras:
@@ -180,8 +166,3 @@ def _cameras(viewmats: np.ndarray, Ks: np.ndarray, size: np.ndarray) -> Cameras:
     return Cameras(
         torch.from_numpy(viewmats).float(), lenses, np.tile(np.rint(size).astype(np.int64), (len(lenses), 1))
     )
-
-
-def _unit(vector: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vector)
-    return vector / length if length > 1e-9 else otherwise / np.linalg.norm(otherwise)

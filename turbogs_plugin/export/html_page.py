@@ -15,10 +15,9 @@ from torch import Tensor
 
 from turbogs_plugin.engine.reference.projection import rotation_matrices
 from turbogs_plugin.engine.reference.spherical_harmonics import evaluate, unit_directions
-from turbogs_plugin.export.camera_path import focus_and_up
 from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.types import SH_C0, Cameras, Color, Gaussians
-from turbogs_plugin.viewer.camera import ViewerCamera
+from turbogs_plugin.viewer.camera import ViewerCamera, focus_and_up
 from turbogs_plugin.viewer.server import quiet_server
 
 MOST_DIRECTIONS = 24

@@ -1,4 +1,5 @@
-"""The camera of a page of the viewer: checked as a client tells it, and as an engine renders it."""
+"""The camera of a page of the viewer: checked as a client tells it, and as an engine renders it; and what a capture's
+cameras look at."""
 
 from __future__ import annotations
 
@@ -85,3 +86,23 @@ class ViewerCamera:
         K = np.array([[focal, 0.0, self.width / 2.0], [0.0, focal, self.height / 2.0], [0.0, 0.0, 1.0]])
         viewmats, Ks = (torch.from_numpy(array[None]).float().to(device) for array in (viewmat, K))
         return Cameras(viewmats, Ks, np.array([[self.width, self.height]], dtype=np.int64))
+
+
+def focus_and_up(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """The point nearest to all lines of sight (least squares), [3], and the mean upward direction, [3], a unit vector.
+    Where the lines are parallel, or meet behind the cameras, the point is one unit in front of their mean."""
+    centers, directions = (value.double().cpu().numpy() for value in (cameras.centers, cameras.directions))
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # [C, 3, 3]
+    matrix = across.mean(axis=0)
+    point = centers.mean(axis=0) + _unit(directions.mean(axis=0), np.array([0.0, 0.0, 1.0]))
+    if np.linalg.eigvalsh(matrix)[0] > 1e-3:
+        nearest = np.linalg.solve(matrix, np.einsum("cij,cj->i", across, centers) / len(centers))
+        if np.median(((nearest - centers) * directions).sum(axis=1)) > 0:
+            point = nearest
+    down = cameras.viewmats[:, 1, :3].double().cpu().numpy().mean(axis=0)
+    return point, _unit(-down, np.array([0.0, -1.0, 0.0]))
+
+
+def _unit(vector: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vector)
+    return vector / length if length > 1e-9 else otherwise / np.linalg.norm(otherwise)

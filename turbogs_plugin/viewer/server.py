@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.viewer.camera import ViewerCamera
+from turbogs_plugin.viewer.camera import ViewerCamera, focus_and_up
 from turbogs_plugin.viewer.frames import Frames
 from turbogs_plugin.viewer.pictures import CaptureViews, Picture
 
@@ -121,9 +121,7 @@ class Page:
         """Offer the views of a capture, and stand at the first one."""
         self.capture = capture
         cameras = capture.train.cameras
-        up = -cameras.viewmats[:, 1, :3].double().mean(dim=0).cpu().numpy()
-        if (length := np.linalg.norm(up)) > 1e-3:
-            self.server.scene.set_up_direction(tuple(up / length))
+        self.server.scene.set_up_direction(focus_and_up(cameras)[1])
         self._slider.max = max(1, len(capture) - 1)
         self._slider.visible = self._there.visible = True
         self.stand_at(ViewerCamera.of_view(cameras, 0))
