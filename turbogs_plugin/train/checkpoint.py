@@ -1,8 +1,7 @@
-"""Checkpoints: plain tensors and numbers in one file, never half-written, never executed.
+"""Checkpoints: plain tensors and numbers (`RunSession.state_dict`, `TrainingState.state_dict`), never executed.
 
 A run's folder ``checkpoints/`` holds ``iteration-NNNNNN.pt`` files, each put in place by one rename, so every one is
-complete and the newest is that of the latest iteration. What a checkpoint holds: `RunSession.state_dict` and
-`TrainingState.state_dict`.
+complete, and the newest is of the latest iteration.
 """
 
 from __future__ import annotations
@@ -31,8 +30,8 @@ _NAME = re.compile(r"iteration-(\d{6,})\.pt")
 
 def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path:
     """Write the state of a run, nested dicts, lists and tuples of tensors and plain values, after this number of
-    iterations, into its folder ``checkpoints/``, and make it the newest one. Raises `TrainingStopped` where the disk
-    refused, and the checkpoint before stays the newest; `TypeError` where something is not plain."""
+    iterations, as its newest checkpoint. Raises `TrainingStopped` where the disk refused, and the checkpoint before
+    stays the newest; `TypeError` where something is not plain."""
     for place, value in leaves(state, "state"):
         if type(value) not in (Tensor, int, float, bool, str, type(None)):
             raise TypeError(f"{place}: a checkpoint holds tensors and plain values, not {type(value).__name__}")
@@ -41,10 +40,8 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
         folder.mkdir(parents=True, exist_ok=True)
         save_plain(path, {"format": FORMAT, **state})
     except OSError as error:
-        raise TrainingStopped(
-            f"iteration {iteration}: the checkpoint could not be written to '{folder}' ({error.strerror or error}): "
-            "once it can be, go on with --resume"
-        ) from error
+        said = f"the checkpoint could not be written to '{folder}' ({error.strerror or error})"
+        raise TrainingStopped(f"iteration {iteration}: {said}: once it can be, go on with --resume") from error
     for leftover in folder.glob(".iteration-*.part"):  # from a killed process
         leftover.unlink(missing_ok=True)
     for old in _complete(folder)[:-KEPT]:
@@ -60,8 +57,7 @@ def _complete(folder: Path) -> list[Path]:
 
 def latest_checkpoint(folder: Path) -> Path | None:
     """The newest checkpoint of a ``checkpoints/`` folder, or None if there is none."""
-    complete = _complete(folder)
-    return complete[-1] if complete else None
+    return next(reversed(_complete(folder)), None)
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
