@@ -82,7 +82,7 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         gaussians = loaded.map(lambda value: value.float().to(device))
         exposures = trained["exposures"]["offsets"].to(device) if config.train.exposure is True else None
         if not (gaussians.finite_rows().all() and 0 <= iteration < COUNT_LIMIT):
-            raise ValueError("its Gaussians or its iteration are none")
+            raise ValueError("its Gaussians are not finite, or its iteration is none")
         if exposures is not None and not (exposures.shape[1:] == (3, 4) and exposures.isfinite().all()):
             raise ValueError("its exposures are none")
         return SavedModel(folder, config, gaussians, frame_of_state(state), iteration, exposures)
