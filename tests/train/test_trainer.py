@@ -67,7 +67,7 @@ def test_a_run_leaves_everything_that_it_promises(whole, capture):
     assert history[-1]["psnr"] == pytest.approx(measured.mean.psnr) and len(measured.views) == 1
 
     page = folder.report.read_text()
-    for promised in ("psnr.png", "l1.png", "test-000.jpg", "iterations: 14", "gsplat", "LPIPS was not computed", "FPS"):
+    for promised in ("psnr.png", "l1.png", "test-000.jpg", "config.yaml", "gsplat", "LPIPS was not computed", "FPS"):
         assert promised in page
     for name in ("psnr.png", "l1.png", "test-000.jpg"):
         Image.open(folder.path / "report" / name).verify()

@@ -14,6 +14,7 @@ from turbogs_plugin.captures.transforms import number_of, opengl_viewmat, pinhol
 from turbogs_plugin.captures.undistort import LARGEST_SIDE
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.placement import out_of_nerfstudio
+from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.geometry import camera_centers, evenly, look_at, seen
 from turbogs_plugin.types import Cameras
@@ -76,11 +77,11 @@ def from_file(path: Path, scene: Scene, frames: int) -> Cameras:
     frame, and a ``transform_matrix`` each, from camera to world, in the capture's own coordinates and OpenGL's axes),
     of nerfstudio's viewer (``camera_path``, in nerfstudio's world if its `TRANSFORMS` lies beside the file), or Inria's
     ``cameras.json``. Raises `InputError` where it is none of these."""
-    content, changes = parse_json(text_of(path), str(path)), []
+    content, changes = parse_json(text_of(path), str(path)), [Similarity(np.eye(3), 1.0, np.zeros(3))]
     if isinstance(content, list) and content and all(isinstance(entry, dict) for entry in content):
         entries = [_of_inria(entry, f"{path}: camera {place}") for place, entry in enumerate(content)]
     elif isinstance(content, dict) and isinstance(content.get("camera_path"), list):
-        entries, changes = _of_nerfstudio(content, path), out_of_nerfstudio(path)
+        entries, changes = _of_nerfstudio(content, path), out_of_nerfstudio(path) or changes
     else:
         shared, own = read_frames(path)
         entries = [shared | entry for entry in own]
@@ -89,11 +90,10 @@ def from_file(path: Path, scene: Scene, frames: int) -> Cameras:
     cameras = [_camera(entry, path, place) for place, entry in enumerate(entries)]
     viewmats, Ks, sizes = (np.stack(each) for each in zip(*cameras, strict=True))
     Ks[:, :2] *= (sizes[0] / sizes)[:, :, None]
-    if changes:
-        points = scene.frame.restore_points(scene.points[evenly(len(scene.points), 1000)].cpu().numpy())
-        moved, some = [change.apply_to_poses(viewmats) for change in changes], evenly(len(viewmats), MOST_KEYS)
-        viewmats = max(moved, key=lambda each: sum(len(seen(points, each[i], Ks[i], sizes[0])[0]) for i in some))
-    return interpolated(scene.frame.normalise_poses(viewmats), Ks, sizes[0], frames)
+    points, some = scene.points[evenly(len(scene.points), 1000)].cpu().numpy(), evenly(len(viewmats), MOST_KEYS)
+    moved = [Similarity.into(scene.frame).after(change).apply_to_poses(viewmats) for change in changes]
+    best = max(moved, key=lambda each: sum(len(seen(points, each[i], Ks[i], sizes[0])[0]) for i in some))
+    return interpolated(best, Ks, sizes[0], frames)
 
 
 def _camera(values: dict[str, Any], path: Path, place: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

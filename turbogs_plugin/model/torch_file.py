@@ -56,34 +56,34 @@ def read_plain(path: Path, name: str, remedy: str = "") -> Any:
 
 
 def save_plain(path: Path, state: Any) -> None:
-    """`torch.save` of tensors and plain values into a file that is written whole or not at all. Raises `OSError` if the
-    disk refused, `TypeError` where something is not plain."""
-    plain = _plain(state)
+    """`torch.save` into a file that is written whole or not at all. Raises `OSError` if the disk refused."""
     try:
-        write_atomically(path, lambda file: torch.save(plain, file), large=True)
+        write_atomically(path, lambda file: torch.save(_alone(state), file), large=True)
     except RuntimeError as error:  # of torch, about positions in the file
         cause = error.__context__
         raise cause if isinstance(cause, OSError) else OSError(str(error).splitlines()[0]) from error
 
 
-def _plain(value: Any) -> Any:
+def _alone(value: Any) -> Any:
     """`value` with tensors of a GPU that are parts of a larger storage copied to the host: torch saves whole storages.
     Tensors of the host are left: maps there may lie in files."""
     if isinstance(value, dict):
-        return {_plain(key): _plain(item) for key, item in value.items()}
+        return {key: _alone(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return type(value)(map(_plain, value))
-    if type(value) not in (Tensor, int, float, bool, str, type(None)):
-        raise TypeError(f"a file holds tensors and plain values, not {type(value).__name__}")
+        return type(value)(map(_alone, value))
     part = isinstance(value, Tensor) and value.is_cuda and value.untyped_storage().nbytes() > value.nbytes
     return value.cpu() if part else value
 
 
 def leaves(value: Any, place: str) -> Iterator[tuple[str, Any]]:
-    """(place, value) of every value in nested dicts, lists and tuples."""
-    if isinstance(value, dict | list | tuple):
-        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+    """(place, value) of every value in nested dicts, lists and tuples, and of the dicts' keys."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield f"{place}.{key}", key
             yield from leaves(item, f"{place}.{key}")
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            yield from leaves(item, f"{place}[{index}]")
     else:
         yield place, value
 

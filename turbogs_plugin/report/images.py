@@ -55,13 +55,9 @@ def error_picture(photo: Tensor, image: Tensor) -> Tensor:
 
 
 def depth_picture(depths: np.ndarray) -> np.ndarray:
-    """Depths [H, W] as a picture, [H, W, 3] uint8: near is bright, far is dark, no depth (0) is black.
-
-    The scale of colours is even in 1 / depth, so that near depths have most of it, and goes from the 1st to the 99th
-    percentile of 1 / depth in this image.
-    """
-    seen = depths > 0
-    if not seen.any():
+    """Depths [H, W] as a picture, [H, W, 3] uint8: near is bright, far is dark, no depth (0) is black. The scale of
+    colours is even in 1 / depth, so that near depths have most of it, from its 1st to its 99th percentile."""
+    if not (seen := depths > 0).any():
         return np.zeros((*depths.shape, 3), dtype=np.uint8)
     nearness = 1.0 / np.where(seen, depths, 1.0)
     far, near = np.percentile(nearness[seen], [1, 99])

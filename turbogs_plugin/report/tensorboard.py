@@ -5,19 +5,16 @@ Evaluations stop the clock of training, so the event files cost no time that is 
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from collections.abc import Callable
 from dataclasses import asdict
-from typing import TYPE_CHECKING
 
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.train.history import Evaluation
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.session import RunSession
-
-if TYPE_CHECKING:
-    from torch.utils.tensorboard import SummaryWriter
 
 INSTALL = 'pip install "tensorboard>=2.12"'
 GROUPS = {"num_gaussians": "counts", "nonfinite_losses": "counts", "skipped_updates": "counts"}
@@ -28,36 +25,25 @@ GROUPS |= {"train_seconds": "cost", "memory_bytes": "cost"}
 def event_writers(config: Config) -> list[Callable[[RunSession], Listener]]:
     """Makers of the listeners that a run with this configuration needs: one that writes event files, or none. Raises
     `InputError` where event files are asked for, and the package is not installed."""
-    if not config.report.tensorboard:
-        return []
-    _writer_class()
-    return [EventWriter]
+    if config.report.tensorboard and importlib.util.find_spec("tensorboard") is None:
+        raise InputError(f"report.tensorboard needs the package tensorboard: {INSTALL}")
+    return [EventWriter] if config.report.tensorboard else []
 
 
 class EventWriter(Listener):
     """Writes event files for TensorBoard at each evaluation of a run, new or resumed."""
 
     def __init__(self, session: RunSession) -> None:
-        self._folder = session.folder.tensorboard
+        from torch.utils.tensorboard import SummaryWriter
+
         # The history of a resumed run ends at its checkpoint: later points of earlier files are void.
-        self._first = session.trainer.iteration + 1 if session.resumed else 0
-        self._writer: SummaryWriter | None = None
+        first = session.trainer.iteration + 1 if session.resumed else 0
+        self._writer = SummaryWriter(str(session.folder.tensorboard), purge_step=first)
 
     def evaluated(self, loop: TrainingLoop, evaluation: Evaluation) -> None:
-        if self._writer is None:
-            self._writer = _writer_class()(str(self._folder), purge_step=self._first)
         for name, value in asdict(evaluation).items():
             if name != "iteration" and not math.isnan(value):
                 self._writer.add_scalar(f"{GROUPS.get(name, 'test')}/{name}", value, evaluation.iteration)
         self._writer.flush()
         if loop.finished:
             self._writer.close()  # and its thread
-            self._writer = None
-
-
-def _writer_class() -> type[SummaryWriter]:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise InputError(f"report.tensorboard needs the package tensorboard: {INSTALL}") from error
-    return SummaryWriter

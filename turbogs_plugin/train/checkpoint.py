@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.model.torch_file import read_plain, save_plain
+from turbogs_plugin.model.torch_file import leaves, read_plain, save_plain
 
 FORMAT = 2
 KEPT = 2
@@ -32,6 +32,9 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
     """Write the state of a run, nested dicts, lists and tuples of tensors and plain values, after this number of
     iterations, into its folder ``checkpoints/``, and make it the newest one. Raises `TrainingStopped` where the disk
     refused, and the checkpoint before stays the newest; `TypeError` where something is not plain."""
+    for place, value in leaves(state, "state"):
+        if type(value) not in (Tensor, int, float, bool, str, type(None)):
+            raise TypeError(f"{place}: a checkpoint holds tensors and plain values, not {type(value).__name__}")
     path = folder / f"iteration-{iteration:06d}.pt"
     try:
         folder.mkdir(parents=True, exist_ok=True)
