@@ -207,7 +207,8 @@ class SharedRendered(Rendered):
         plain = None
         if self._rendered is not None:
             slots = self.batch.shares[self.batch.rank].slots
-            own = {name: None if value is None else value[slots] for name, value in vars(upstream).items()}
+            given = vars(upstream).items()
+            own: dict[str, Any] = {name: None if value is None else value[slots] for name, value in given}
             plain = self._rendered.backward(**own, with_statistics=with_statistics).plain()
         return SharedScreen(self.batch, plain)
 
