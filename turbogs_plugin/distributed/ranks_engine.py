@@ -158,9 +158,10 @@ class RanksEngine:
             self.engine.update(rule, own_screen, owned.gaussians, owned.moments, owned.stats, copies)
         self._exchange.stepped(gaussians)
 
-    def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
-        if self._owned is None or moments is None:
+    def complete(self) -> None:
+        if self._owned is None:
             return
+        _, moments, stats = self._owned.whole
         statistics = [] if stats is None else list(vars(stats).values())
         self._owned = None  # an event makes new tensors, beside which the old ones have no room
         tensors = [moments.exp_avg, moments.exp_avg_sq, moments.exp_avg_shN, moments.exp_avg_sq_shN, moments.steps]
