@@ -114,7 +114,7 @@ class Trainer(TrainingState):
         (mcmc's noise) is taken back in a skipped iteration, which is made again (`Engine.overflow`)."""
         due, overflow = self.density.event_due(step), self.engine.overflow
         if due:
-            self.engine.complete(self.optimizer.moments, self.density.stats)
+            self.engine.complete()
         before = self.gaussians.map(Tensor.clone) if overflow is not None and self.density.moves_model else None
         update = self.density.update(self.gaussians, step)
         if overflow is not None and before is not None and update is None:

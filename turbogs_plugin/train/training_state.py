@@ -194,7 +194,7 @@ class TrainingState:
 
     def complete(self) -> None:
         """Make the whole state valid, before it is evaluated or saved. Raises `TrainingStopped` as `Engine.verify`."""
-        self.engine.complete(self.optimizer.moments, self.density.stats)
+        self.engine.complete()
         self.engine.verify(self.state_dict)
 
     def require_finite(self) -> None:
