@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from turbogs_plugin.engine.render import rasterize as rasterize
     from turbogs_plugin.engine.render import render_image as render_image
     from turbogs_plugin.export.camera_path import orbit as orbit
-    from turbogs_plugin.train.fit import fit as fit
+    from turbogs_plugin.train.run import fit as fit
     from turbogs_plugin.train.saved_model import load_model as load_model
 
 __version__ = "0.1.0"
@@ -41,7 +41,7 @@ def lazy_face(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], 
 
 
 _PLACES = {
-    "fit": "turbogs_plugin.train.fit",
+    "fit": "turbogs_plugin.train.run",
     "load_scene": "turbogs_plugin.captures",
     "rasterize": "turbogs_plugin.engine.render",
     "render_image": "turbogs_plugin.engine.render",

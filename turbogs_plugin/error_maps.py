@@ -84,12 +84,11 @@ class ErrorMaps:
     def from_images(
         cls, errors: Tensor | Sequence[Tensor], masks: Tensor | Sequence[Tensor] | None = None, **options: Any
     ) -> ErrorMaps:
-        """Maps that start from given error images.
+        """Maps that start from given error images; `options` are further arguments of `ErrorMaps`.
 
         Args:
             errors: [V, H, W] float, or V tensors [H, W] whose sizes may differ; the maps live on their device.
             masks: of the same shapes, True (nonzero) where a pixel counts; None: all do.
-            options: further arguments of `ErrorMaps`.
 
         Raises:
             InputError: there is no image, one is not a finite tensor [H, W], or a mask has another shape.

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.optim.adam import adam
 
 from turbogs_plugin.engine.moments import check_state
-from turbogs_plugin.engine.reference.update import clipped, finite_gradients
+from turbogs_plugin.engine.reference.update import clipped
 from turbogs_plugin.errors import require
 from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.learning_rates import LearningRates
@@ -63,13 +63,14 @@ class DenseAdam:
     @torch.no_grad()
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, step: Step) -> None:
         require("counts" in vars(self), "optimizer", type(self).__name__, "set up, by setup(gaussians) before step")
-        finite, touched = finite_gradients(gradients), gradients.touched
+        sums = Gaussians(**{name: gradients.summed(name) for name in PARAMETER_NAMES})
+        finite, touched = sums.finite_rows(), gradients.touched
         self.skipped += (touched & ~finite).sum()
         rates = self.learning_rates.at(step)
         # Torch's way of skipping an iteration without waiting for the device.
         nothing = (~touched.any()).to(torch.float32)
         for count, (name, parameter) in zip(self.counts.unbind(), gaussians.items(), strict=True):
-            gradient = gradients.summed(name)  # in the parameter's own shape
+            gradient = getattr(sums, name)
             rows = finite.reshape(-1, *[1] * (gradient.dim() - 1))
             gradient = clipped(torch.where(rows, gradient, 0.0)).contiguous()
             if name == "opacities" and self.opacity_reg > 0:

@@ -174,7 +174,11 @@ class Alone:
 def test_a_model_may_be_placed_over_itself_and_others_have_the_same_places(monkeypatch):
     monkeypatch.setattr(in_place, "LEAST", 0)
     model = random_gaussians(40)
-    memory = InPlace(Alone(), lambda ranks, size, device: PeerMemory([torch.zeros(size) for _ in range(2)], print))
+
+    def share(ranks: Alone, size: int, device: torch.device) -> PeerMemory:
+        return PeerMemory([torch.zeros(size) for _ in range(2)], print)
+
+    memory = InPlace(ReferenceEngine(), Alone(), share)
     whole = memory.place(model)
     half = memory.place(whole.map(lambda value: value[::2]))  # of the very memory that it overwrites
     (other,) = memory.others(half)

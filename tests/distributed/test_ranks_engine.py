@@ -256,8 +256,9 @@ def test_rows_are_owned_in_aligned_runs():
 
 def test_skipped_updates_of_every_owner_count():
     engine, moments = RanksEngine.__new__(RanksEngine), GaussianMoments.zeros(random_gaussians(4))
-    engine.ranks, engine._owned, engine._skipped = SimpleNamespace(gather_numbers=lambda own: [[2], own, [5]]), True, 10
+    engine.ranks, engine._skipped = SimpleNamespace(gather_numbers=lambda own: [[2], own, [5]]), 10
+    engine._owned = SimpleNamespace(whole=(None, moments, None))
     moments.skipped.fill_(13)
     with patch("turbogs_plugin.distributed.ranks_engine.gather_rows"):
-        engine.complete(moments, None)
+        engine.complete()
     assert int(moments.skipped) == 10 + 2 + 3 + 5

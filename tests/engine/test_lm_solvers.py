@@ -7,12 +7,7 @@ import pytest
 import torch
 from helpers.exact_solver import solve_exactly
 
-from turbogs_plugin.engine.reference.lm_solvers import (
-    ROW_LIMIT,
-    scaled_rows,
-    solve_low_rank,
-    solve_scaled_cholesky,
-)
+from turbogs_plugin.engine.reference.lm_solvers import ROW_LIMIT, scaled_rows, solve_low_rank, solve_scaled_cholesky
 
 STABLE = [solve_scaled_cholesky, solve_low_rank]
 
@@ -68,9 +63,7 @@ def test_extremes_stay_finite(solve, dtype):
     first, second, d1, d2, b = torch.meshgrid(rows, rows, damping, damping, rhs, indexing="ij")
     row = torch.stack([first, second, first], dim=-1).reshape(1, -1, 3).repeat(5, 1, 1)
     solution = solve(
-        row,
-        torch.stack([d1, d2, d2], dim=-1).reshape(-1, 3),
-        torch.stack([b, -b, b], dim=-1).reshape(-1, 3),
+        row, torch.stack([d1, d2, d2], dim=-1).reshape(-1, 3), torch.stack([b, -b, b], dim=-1).reshape(-1, 3)
     )
     assert torch.isfinite(solution).all()
     assert (scaled_rows(row, torch.ones_like(row[0])).norm(dim=-1) <= 1.001 * ROW_LIMIT).all()

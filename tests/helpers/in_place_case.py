@@ -21,6 +21,7 @@ from turbogs_plugin.distributed.messages import Messages, gather_rows
 from turbogs_plugin.distributed.processes import joined
 from turbogs_plugin.distributed.ranks import ProcessRanks, Ranks
 from turbogs_plugin.distributed.ranks_engine import RanksEngine, SharedScreen
+from turbogs_plugin.engine import ReferenceEngine
 from turbogs_plugin.engine.cuda import workspace
 from turbogs_plugin.engine.render_pass import ScreenRecords
 from turbogs_plugin.train.loop import TrainingLoop
@@ -48,8 +49,8 @@ class Kept:
     def around(self, method: Callable, kept: Callable) -> Callable:
         return lambda *arguments: kept(method, *arguments)
 
-    def kept_colors(self, colors: Callable, memory: InPlace, engine: Any, shares: list, own: Any, *flags: Any) -> Any:
-        found = colors(memory, engine, shares, own, *flags)
+    def kept_colors(self, colors: Callable, memory: InPlace, shares: list, own: Any, *flags: Any) -> Any:
+        found = colors(memory, shares, own, *flags)
         # The next pass overwrites what this one has rendered and gathered.
         self.colors.append((shares, None if own is None else own.clone(), found.clone()))
         return found
@@ -74,10 +75,10 @@ class Kept:
     def compare(self, ranks: ProcessRanks) -> None:
         for (owner, name), method in self._before.items():
             setattr(owner, name, method)
-        messages, engine = Messages(ranks), None  # which need no engine to collect
+        messages = Messages(ReferenceEngine(), ranks)
         for screen, rows, records, radii in self.screens:
             target = ScreenRecords(torch.empty_like(records), torch.empty_like(radii))
-            messages.collect(engine, screen.batch.shares, rows, screen._plain, target)
+            messages.collect(screen.batch.shares, rows, screen._plain, target)
             assert torch.equal(radii, target.radii)
             seen = (radii > 0).any(dim=-1)
             # A pass that overflows draws nothing: what lies there may be NaN.

@@ -21,20 +21,14 @@ from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, 
 
 def state(value: float = 1.0) -> dict:
     return {
-        "tensors": {"a": torch.full((50, 3), value), "half": torch.ones(3, dtype=torch.float16)},
+        "tensors": {"a": torch.full((50, 3), float(value)), "half": torch.ones(3, dtype=torch.float16)},
         "numbers": [1, 2.5, True, None, "text"],
         "pair": (1, 2),
     }
 
 
 def assert_newest(folder, value: float) -> None:
-    assert torch.equal(load_checkpoint(latest_checkpoint(folder))["tensors"]["a"], state(value)["tensors"]["a"])
-
-
-def test_what_goes_in_comes_out(tmp_path):
-    path = save_checkpoint(tmp_path / "new", 7, state())
-    assert latest_checkpoint(tmp_path / "new") == path
-    assert_identical(load_checkpoint(path), state())
+    assert_identical(load_checkpoint(latest_checkpoint(folder)), state(value))
 
 
 @pytest.mark.parametrize("iterations", [(5,), (5, 100), (1, 5, 100), (995_000, 997_500, 1_000_000, 1_002_500)])

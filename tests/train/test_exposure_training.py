@@ -18,11 +18,10 @@ from turbogs_plugin.report.evaluation import evaluate_run
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.train import training_state
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
-from turbogs_plugin.train.fit import fit
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.look import Look, interpolated_exposures
 from turbogs_plugin.train.metrics import evaluate, render_view
-from turbogs_plugin.train.run import train
+from turbogs_plugin.train.run import fit, train
 
 pytestmark = pytest.mark.usefixtures("plotted")
 

@@ -218,6 +218,8 @@ def test_training_starts_from_a_model_where_that_had_ended_and_goes_on_without_i
 def test_a_model_that_is_larger_than_the_cap_is_refused(finished, scene):
     with pytest.raises(InputError, match=r"more than density\.max_gaussians 100 allows.*start from points"):
         tiny_trainer(scene, f"train.init={finished}", "density.max_gaussians=100")
+    with pytest.raises(InputError, match="no room beside the 3000"):
+        tiny_trainer(scene, "density.max_gaussians=3000", "train.backdrop=true")
 
 
 BAD_FILES = {

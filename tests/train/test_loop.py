@@ -8,7 +8,6 @@ from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin.config.sections import TrainConfig
 from turbogs_plugin.train.loop import Listener, TrainingLoop
-from turbogs_plugin.train.pace import Pace
 
 
 class CountingTrainer:
@@ -72,7 +71,8 @@ class StopAt5(Listener):
 
 def test_an_evaluation_comes_before_the_checkpoint_of_the_same_place():
     trainer, diary = CountingTrainer(6, evaluate_at=(0.5,), checkpoint_every=3), Diary()
-    loop = TrainingLoop(trainer, listeners=[diary])
+    loop = TrainingLoop(trainer)
+    loop.listeners = [diary]
     loop.run()
     assert diary.lines == [("begun", 0), *(("evaluation", 3), ("checkpoint", 3)), ("evaluation", 6), ("checkpoint", 6)]
     assert loop.finished and not loop.stopped and trainer.steps == [1, 2, 3, 4, 5, 6]
@@ -83,7 +83,9 @@ def test_an_evaluation_comes_before_the_checkpoint_of_the_same_place():
 def test_no_iteration_is_missing_at_a_mark(lost):
     """All from the lost one up to the mark are repeated before anything is said to be due there."""
     trainer, diary = CountingTrainer(6, lost, evaluate_at=(0.5,), checkpoint_every=0), Diary()
-    TrainingLoop(trainer, listeners=[diary]).run()
+    loop = TrainingLoop(trainer)
+    loop.listeners = [diary]
+    loop.run()
     mark = 3 if lost[0] <= 3 else 6
     repeated = list(range(lost[0], mark + 1))
     assert trainer.steps == [*range(1, mark + 1), *repeated, *range(mark + 1, 7)]
@@ -93,7 +95,8 @@ def test_no_iteration_is_missing_at_a_mark(lost):
 def test_no_iteration_is_missing_at_a_stop():
     """Back at a place that was evaluated and saved before, it is not evaluated and saved again."""
     trainer, diary = CountingTrainer(9, lost=(4,), evaluate_at=(1 / 3,), checkpoint_every=3), Diary()
-    loop = TrainingLoop(trainer, listeners=[diary, StopAt5()])
+    loop = TrainingLoop(trainer)
+    loop.listeners = [diary, StopAt5()]
     loop.run()
     assert loop.stopped and not loop.finished and trainer.iteration == 3 and not trainer.concluded
     assert diary.lines == [("begun", 0), ("evaluation", 3), ("checkpoint", 3)]
@@ -113,6 +116,7 @@ def test_only_training_is_on_the_clock(monkeypatch):
     step, initialise = trainer.step, trainer.initialise_maps
     trainer.step = lambda: (step(), clock.passes(1.0))
     trainer.initialise_maps = lambda: (initialise(), clock.passes(1.0))
-    loop = TrainingLoop(trainer, Pace(trainer.config.train), [Slow()], seconds=2.0)
+    loop = TrainingLoop(trainer, seconds=2.0)
+    loop.listeners = [Slow()]
     loop.run()
     assert loop.clock.seconds == 2.0 + 1.0 + 6.0

@@ -30,7 +30,9 @@ class Kept(Listener):
 
 def trained(capture, *overrides: str) -> tuple[Trainer, Kept]:
     kept, trainer = Kept(), tiny_trainer(capture, *overrides)
-    TrainingLoop(trainer, None, [kept]).run()
+    loop = TrainingLoop(trainer)
+    loop.listeners = [kept]
+    loop.run()
     return trainer, kept
 
 

@@ -8,10 +8,11 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 from helpers.framework_runs import tiny_config
 from helpers.refusals import assert_refused
 
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.report.curves import plot_against_seconds
 from turbogs_plugin.report.images import save_image
@@ -80,19 +81,16 @@ def test_a_new_folder_that_another_has_written_to_and_a_lock_that_is_a_link_are_
 def test_a_run_that_ends_before_its_first_checkpoint_does_not_claim_its_folder(capture, tmp_path, monkeypatch):
     folder, config = RunFolder(tmp_path / "run"), tiny_config(capture, "train.iterations=2", "train.evaluate_at=[]")
     with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "step", lambda trainer: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
+        patch.setattr(Trainer, "step", lambda trainer: (_ for _ in ()).throw(torch.cuda.OutOfMemoryError))
+        words = r"too small for \d+ Gaussians; try --max-gaussians \d+; no checkpoint"
+        with pytest.raises(TrainingStopped, match=words):
             run.train(config, folder.path)
-    folder.checkpoints.mkdir()
-    (folder.checkpoints / ".iteration-000002.pt.part").touch()
     (folder.path / "notes.txt").touch()
-    with pytest.raises(InputError, match="is not empty: choose a new folder"):
-        folder.require_new()
+    assert_refused("is not empty: choose a new folder", run.train, config, folder.path)
     (folder.path / "notes.txt").unlink()
     run.train(config, folder.path)
     assert [line.iteration for line in read_history(folder.history)] == [0, 2]
-    with pytest.raises(InputError, match="is not empty: choose a new folder"):
-        folder.require_new()
+    assert_refused("is not empty: choose a new folder", run.train, config, folder.path)
 
 
 WRITERS = {

@@ -30,10 +30,10 @@ from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.strategies.protocols import PixelSampler, SparseLoss
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
-from turbogs_plugin.train.fit import fit
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.train.metrics import evaluate
+from turbogs_plugin.train.run import fit
 from turbogs_plugin.train.session import interruptible
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import LossOutput, PixelSamples, RowUpdate
@@ -294,7 +294,7 @@ def test_what_stands_before_a_camera_goes_with_the_next_change(capture, clears, 
         ("schedule.type=fixed", "view_sampler.type=random", "pixel_sampler.type=random", "loss.type=charbonnier"),
         ("schedule.type=linear", "loss.type=sparse_ssim", "optimizer.type=sparse_adam", "density.type=none"),
         ("schedule.type=exponential", "pixel_sampler.type=dense", "density.type=gsplat_default"),
-        ("pixel_sampler.importance=0.5", "density.score=raw"),
+        ("pixel_sampler.importance=0.5", "optimizer.type=moment_lm", "density.score=raw"),
         ("pixel_sampler.unit=tile", "train.sh_degree=0", "train.backdrop=true"),
     ],
     ids=lambda overrides: overrides[0],

@@ -30,8 +30,8 @@ class RunOptions:
     """Options of train and plan that change a configuration.
 
     Args:
-        config: turbogs where absent; turbogs-big, -ssim, -paper, paper-literal, 3dgs, 3dgs-as-shipped, mcmc, demo; or
-            a .yaml file.
+        config: turbogs where absent, turbogs-big, turbogs-ssim, turbogs-paper, paper-literal, 3dgs, 3dgs-as-shipped,
+            mcmc, demo, or a .yaml file.
         factor: scale photos down by this.
         device: where to train; auto takes a GPU where there is one.
         max_gaussians: limit of the finished model (density.max_gaussians). While it grows it may have some more.

@@ -51,11 +51,11 @@ RECORD, RADII = ScreenRecord.SIZE, 2
 
 
 class InPlace:
-    """This process's memory for passes and for the model, and views of every process's. `share` gives memory that all
-    read and write, or None; it is not asked again then."""
+    """This process's memory for the passes of its engine and for the model, and views of every process's. `share` gives
+    memory that all read and write, or None; it is not asked again then."""
 
-    def __init__(self, ranks: ProcessRanks, share: Sharing) -> None:
-        self._ranks, self._share, self._possible = ranks, share, True
+    def __init__(self, engine: SharedEngine, ranks: ProcessRanks, share: Sharing) -> None:
+        self._engine, self._ranks, self._share, self._possible = engine, ranks, share, True
         self._passes: tuple[PeerMemory, PassMemory] | None = None  # of all processes, and this one's
         self._slots = self._instances = 0  # there is room for
         self._starts: list[int] = []  # of status, colors, radii and records in a process's memory, in numbers
@@ -94,7 +94,7 @@ class InPlace:
         """The model in the memory of each other process; None where `gaussians` was not placed here."""
         return self._others if gaussians is self._placed else None
 
-    def prepare(self, engine: SharedEngine, shares: Sequence[Share], gaussians: int, device: torch.device) -> bool:
+    def prepare(self, shares: Sequence[Share], gaussians: int, device: torch.device) -> bool:
         """Make room for a pass of N `gaussians`, which the engine keeps in this memory. Every process must call this.
         Returns False where no process has such memory, or engines do not keep passes there."""
         slots = max(share.num_slots for share in shares)
@@ -104,12 +104,12 @@ class InPlace:
             # none has it mapped.
             if self._passes is not None:
                 synchronize(device)  # unmapping waits for the device, with all threads of Python held up
-                engine.lend(None)
+                self._engine.lend(None)
                 self._passes = None
             slots = with_room(slots) if slots > self._slots else self._slots
             instances = with_room(instances) if instances > self._instances else self._instances
             self._reserve(slots, instances, device)
-        return self._passes is not None and engine.lend(self._passes[1])
+        return self._passes is not None and self._engine.lend(self._passes[1])
 
     def _reserve(self, slots: int, instances: int, device: torch.device) -> None:
         """Take memory for passes of these sizes."""
@@ -129,7 +129,7 @@ class InPlace:
         self._possible = memory is not None
         return memory
 
-    def colors(self, engine: SharedEngine, shares: Sequence[Share], own: Tensor | None, seen: Tensor) -> Tensor:
+    def colors(self, shares: Sequence[Share], own: Tensor | None, seen: Tensor) -> Tensor:
         """[P, 3] the colours of all samples. `own`: [., 3] this process's, in the memory that its engine was lent; None
         if it has no samples. `seen`: [2] int32, written: `SharedEngine.gather`."""
         assert self._passes is not None, "prepare says that there is no memory"
@@ -137,15 +137,10 @@ class InPlace:
         if self._ranks.asked:
             lent.status[PassStatus.STOP].fill_(self._ranks.asked)
         memory.barrier(WRITTEN)
-        return engine.gather(memory.parts, self._starts[1], [share.num_slots for share in shares], seen)
+        return self._engine.gather(memory.parts, self._starts[1], [share.num_slots for share in shares], seen)
 
     def collect(
-        self,
-        engine: SharedEngine,
-        shares: Sequence[Share],
-        rows: Sequence[slice],
-        own: ScreenRecords | None,
-        target: ScreenRecords,
+        self, shares: Sequence[Share], rows: Sequence[slice], own: ScreenRecords | None, target: ScreenRecords
     ) -> None:
         """Collect the records of all views for this process's rows.
 
@@ -159,7 +154,8 @@ class InPlace:
         memory.barrier(DRAWN)
         drawn = [(rank, share) for rank, share in enumerate(shares) if len(share)]
         sources = [self._screen(memory.parts[rank], len(share), rows[-1].stop) for rank, share in drawn]
-        engine.collect(sources, [share.views.start for _, share in drawn], target, rows[self._ranks.rank].start)
+        firsts, row = [share.views.start for _, share in drawn], rows[self._ranks.rank].start
+        self._engine.collect(sources, firsts, target, row)
 
     def stepped(self, model: Gaussians | None = None) -> None:
         """Put what this process enqueues next after the steps of all, and after all that the others read of it."""

@@ -26,28 +26,24 @@ ROW_STEP = 4
 class Messages:
     """What several processes send each other in an iteration: the counterpart of `in_place.InPlace`."""
 
-    def __init__(self, ranks: ProcessRanks) -> None:
-        self._ranks = ranks
+    def __init__(self, engine: SharedEngine, ranks: ProcessRanks) -> None:
+        self._engine, self._ranks = engine, ranks
 
-    def colors(self, engine: SharedEngine, shares: Sequence[Share], own: Tensor | None, seen: Tensor) -> Tensor:
+    def colors(self, shares: Sequence[Share], own: Tensor | None, seen: Tensor) -> Tensor:
         """[P, 3] the colours of all samples, by a message of status and colours. Arguments as of `InPlace.colors`."""
         status = torch.zeros(PassStatus.SIZE, dtype=torch.int32, device=seen.device)
         status[PassStatus.STOP] = self._ranks.asked
-        if engine.overflow is not None:
-            status[PassStatus.OVERFLOW :][:1] = engine.overflow
+        if self._engine.overflow is not None:
+            status[PassStatus.OVERFLOW :][:1] = self._engine.overflow
         flat = [] if own is None else [own.flatten()]
         message = torch.cat([status.view(torch.float32), *flat])
         counts = [share.num_slots for share in shares]
         parts = self._ranks.exchange([message] * self._ranks.count, [PassStatus.SIZE + 3 * count for count in counts])
-        return SharedEngine.gather(engine, parts, PassStatus.SIZE, counts, seen)  # in torch: for many processes, too
+        # In torch: for many processes, too.
+        return SharedEngine.gather(self._engine, parts, PassStatus.SIZE, counts, seen)
 
     def collect(
-        self,
-        engine: SharedEngine,
-        shares: Sequence[Share],
-        rows: Sequence[slice],
-        own: ScreenRecords | None,
-        target: ScreenRecords,
+        self, shares: Sequence[Share], rows: Sequence[slice], own: ScreenRecords | None, target: ScreenRecords
     ) -> None:
         """Send every process the records of its rows in this process's views, and put together what all send. Arguments
         as of `InPlace.collect`."""

@@ -76,7 +76,7 @@ class RanksEngine:
         self.draw, self.evaluate, self.learn = engine.draw, engine.evaluate, engine.learn
         self.expose, self.learn_exposures = engine.expose, engine.learn_exposures
         self.evaluate_and_learn, self.supervise = engine.evaluate_and_learn, engine.supervise
-        self.memory, self.messages = InPlace(ranks, share), Messages(ranks)
+        self.memory, self.messages = InPlace(engine, ranks, share), Messages(engine, ranks)
         self._exchange: InPlace | Messages = self.messages  # of the latest pass
         self._passes = 0
         # The largest `PassStatus.OVERFLOW` and `PassStatus.STOP` of all, [2] int32: of the latest pass; and on the way
@@ -100,7 +100,7 @@ class RanksEngine:
         rank, shares = self.ranks.rank, shares_of(samples, self.ranks.count)
         own = shares[rank]
         placed = self.memory.others(gaussians) is not None
-        if placed and self.memory.prepare(self.engine, shares, len(gaussians), self.device):
+        if placed and self.memory.prepare(shares, len(gaussians), self.device):
             self._exchange = self.memory
         elif self._exchange is self.memory:
             self.engine.lend(None)
@@ -110,7 +110,7 @@ class RanksEngine:
             part = cameras.select(range(own.views.start, own.views.stop))
             chosen = samples.of_tiles(own.tiles, own.views, own.slots)
             rendered = self.engine.render(gaussians, part, chosen, options)
-        colors = self._exchange.colors(self.engine, shares, None if rendered is None else rendered.colors, self._seen)
+        colors = self._exchange.colors(shares, None if rendered is None else rendered.colors, self._seen)
         flags = self._seen.to("cpu", non_blocking=True, copy=True)  # from a GPU into pinned memory
         event = torch.cuda.current_stream(self.device).record_event() if self._seen.is_cuda else None
         self._flags.append((self._passes, flags, event))
@@ -158,9 +158,10 @@ class RanksEngine:
             self.engine.update(rule, own_screen, owned.gaussians, owned.moments, owned.stats, copies)
         self._exchange.stepped(gaussians)
 
-    def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
-        if self._owned is None or moments is None:
+    def complete(self) -> None:
+        if self._owned is None:
             return
+        _, moments, stats = self._owned.whole
         statistics = [] if stats is None else list(vars(stats).values())
         self._owned = None  # an event makes new tensors, beside which the old ones have no room
         tensors = [moments.exp_avg, moments.exp_avg_sq, moments.exp_avg_shN, moments.exp_avg_sq_shN, moments.steps]
@@ -207,7 +208,8 @@ class SharedRendered(Rendered):
         plain = None
         if self._rendered is not None:
             slots = self.batch.shares[self.batch.rank].slots
-            own = {name: None if value is None else value[slots] for name, value in vars(upstream).items()}
+            given = vars(upstream).items()
+            own: dict[str, Any] = {name: None if value is None else value[slots] for name, value in given}
             plain = self._rendered.backward(**own, with_statistics=with_statistics).plain()
         return SharedScreen(self.batch, plain)
 
@@ -238,7 +240,7 @@ class SharedScreen(ScreenGradients):
         records = torch.empty(*shape, ScreenRecord.SIZE, device=own.device)
         radii = torch.empty(*shape, 2, dtype=torch.int32, device=own.device)
         target = ScreenRecords(records, radii)
-        batch.exchange.collect(batch.engine, batch.shares, rows, self._plain, target)
+        batch.exchange.collect(batch.shares, rows, self._plain, target)
         return batch.engine.screen_gradients(own, batch.cameras, batch.samples, batch.options, target)
 
 

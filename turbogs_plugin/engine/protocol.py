@@ -154,9 +154,8 @@ class Engine(Protocol):
         """The model where the engine's steps change it: the given one, or a copy over the one placed before."""
         return gaussians
 
-    def complete(self, moments: GaussianMoments | None, stats: GaussianStats | None) -> None:
-        """Make every row of the moments and the statistics valid, before they are read: after `update` some may not be.
-        `moments`: None where the optimizer has no rule, so that `update` is never called."""
+    def complete(self) -> None:
+        """Make every row of the moments and the statistics that `update` was given valid, before they are read."""
         return
 
     def agreed(self, update: RowUpdate | None) -> RowUpdate | None:

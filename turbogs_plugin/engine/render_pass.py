@@ -56,12 +56,8 @@ class ScreenGradients(Protocol):
     """
 
     def parameter_gradients(self, rows: bool, stats: GaussianStats | None = None) -> GaussianGradients:
-        """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once.
-
-        Args:
-            stats: the statistics of density control, to which this pass is added; only after a backward pass
-                ``with_statistics``.
-        """
+        """The gradients of the parameters: one row per view (`rows`), or their sum. May be called once. `stats`: of
+        density control, to which this pass is added; only after a backward pass ``with_statistics``."""
 
     def full_records(self) -> Tensor:
         """[K, N, 16] the gradients on the screen, `layout.ScreenRecord`; zero where a Gaussian is not drawn."""

@@ -1,8 +1,7 @@
-"""Checkpoints: plain tensors and numbers in one file, never half-written, never executed.
+"""Checkpoints: plain tensors and numbers (`RunSession.state_dict`, `TrainingState.state_dict`), never executed.
 
 A run's folder ``checkpoints/`` holds ``iteration-NNNNNN.pt`` files, each put in place by one rename, so every one is
-complete and the newest is that of the latest iteration. What a checkpoint holds: `RunSession.state_dict` and
-`TrainingState.state_dict`.
+complete, and the newest is of the latest iteration.
 """
 
 from __future__ import annotations
@@ -41,10 +40,8 @@ def save_checkpoint(folder: Path, iteration: int, state: dict[str, Any]) -> Path
         folder.mkdir(parents=True, exist_ok=True)
         save_plain(path, {"format": FORMAT, **state})
     except OSError as error:
-        raise TrainingStopped(
-            f"iteration {iteration}: the checkpoint could not be written to '{folder}' ({error.strerror or error}): "
-            "once it can be, go on with --resume"
-        ) from error
+        said = f"the checkpoint could not be written to '{folder}' ({error.strerror or error})"
+        raise TrainingStopped(f"iteration {iteration}: {said}: once it can be, go on with --resume") from error
     for leftover in folder.glob(".iteration-*.part"):  # from a killed process
         leftover.unlink(missing_ok=True)
     for old in _complete(folder)[:-KEPT]:
@@ -60,8 +57,7 @@ def _complete(folder: Path) -> list[Path]:
 
 def latest_checkpoint(folder: Path) -> Path | None:
     """The newest checkpoint of a ``checkpoints/`` folder, or None if there is none."""
-    complete = _complete(folder)
-    return complete[-1] if complete else None
+    return next(reversed(_complete(folder)), None)
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:

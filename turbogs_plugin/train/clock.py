@@ -1,7 +1,4 @@
-"""Seconds on the wall, from the start of a command until the model is written, with the parts that they went into.
-
-A command makes its wall clock before it loads torch, so this module does without.
-"""
+"""Seconds on the wall, from the start of a command, before it loads torch, until the model is written, by parts."""
 
 from __future__ import annotations
 

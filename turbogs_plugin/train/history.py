@@ -19,14 +19,9 @@ MEASURES = ("psnr", "ssim", "l1")
 
 @dataclass(kw_only=True)
 class FurtherErrors:
-    """Errors beside the plain ones, which only some captures have: NaN where they were not asked for or not computed.
-
-    Args:
-        own_psnr, own_ssim, own_l1: of the model's own colours, in runs that learn exposures; the plain ones there are
-            of test views with the exposures of their neighbours (`interpolated_exposures`).
-        refined_psnr, refined_ssim, refined_l1: by refined cameras of the test photos (`PosedImages.refined`), at the
-            end of runs whose capture says which photos show a point.
-    """
+    """Errors beside the plain ones; NaN where they were not computed. `own`: of the model's own colours in runs that
+    learn exposures, where plain ones are of views with the exposures of their neighbours (`interpolated_exposures`).
+    `refined`: by refined cameras of the test photos (`PosedImages.refined`), at the end."""
 
     own_psnr: float = math.nan
     own_ssim: float = math.nan
@@ -79,8 +74,8 @@ def append_evaluation(path: Path, evaluation: Evaluation) -> None:
 
 
 def read_history(path: Path) -> list[Evaluation]:
-    """All complete lines of a history; a last line that a killed process or a loss of power cut short is left out.
-    Raises `InputError` where it cannot be read, or a line is not an evaluation."""
+    """All complete lines of a history, without a last one that a loss of power, say, cut short. Raises `InputError`
+    where it cannot be read, or a line is not an evaluation."""
     text, evaluations = read_text(path) or "", []
     lines = text[: text.rfind("\n") + 1].splitlines()
     for number, line in enumerate(lines, start=1):

@@ -21,9 +21,6 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.agreement import require_agreement, unseeing_note
 from turbogs_plugin.train.clock import WallClock
 
-DEVICE = "CUDA and kernels, after the photos"
-"""The part of the wall time in which the device is waited for."""
-
 
 def resolve_device(name: str) -> torch.device:
     """The device of ``auto``, ``cpu`` or ``cuda``. Raises `InputError` if CUDA is asked for and absent."""
@@ -56,16 +53,14 @@ def show_loading(loaded: int, total: int) -> None:
 
 
 def open_scene(settings: SceneConfig, refine: bool, ranks: Ranks = ONE, trained: bool = False) -> Scene:
-    """A capture. On a terminal, its photos are counted while they are decoded.
+    """A capture. On a terminal, its photos are counted while they are decoded. Raises `InputError`: there is no usable
+    capture, or no training on it can work.
 
     Args:
         refine: `train.refine_cameras`.
         ranks: the processes that train together; each calls this. The first one refines cameras for all: machines
             differ in their last digits, and replicas may not.
         trained: a run has begun on it, so it is not asked again whether training on it can work.
-
-    Raises:
-        InputError: there is no usable capture, or no training on it can work.
     """
     progress = show_loading if ranks.first else None
     scene = load_scene(settings.path, settings.factor, settings.test_every, progress, settings.validation)
@@ -101,5 +96,5 @@ def open_started(
         scene = open_scene(config.scene, config.train.refine_cameras, ranks, trained)
         clock.mark("photos")
         device = started.result()
-    clock.mark(DEVICE)
+    clock.mark("CUDA and kernels, after the photos")
     return scene, device

@@ -1,9 +1,8 @@
 """How a model is shown beside photos: the colour behind it, and the exposures of the photos.
 
 Photos that were not trained get the exposures of the training photos taken before and after them: a camera's automatic
-follows the light, so a photo's exposure is nearly its neighbours'. Nothing of the photo itself is used but its name.
-Deutsch et al. (PPISP, CVPR 2026) have a network predict it from the render, for the same reason: test photos are then
-compared with a model of their scene, not with their camera's settings.
+follows the light. Nothing of the photo itself is used but its name. Deutsch et al. (PPISP, CVPR 2026) have a network
+predict it from the render: test photos are then compared with a model of their scene, not with a camera's settings.
 """
 
 from __future__ import annotations
@@ -33,12 +32,8 @@ class Background:
     @classmethod
     def of(cls, setting: str, transparent: bool) -> Background:
         """The background of a setting, beside photos that may be `transparent`. ``auto``, where no plan was made, is
-        ``random`` for these.
-
-        No colour of the model can stand for a random background, so what is empty or opaque in the photos becomes so in
-        the model. Evaluations then show transparent photos on white, as published numbers of NeRF-synthetic are, opaque
-        ones on black.
-        """
+        ``random`` for these: no colour of the model can stand for it, so what is empty in the photos becomes so in the
+        model. Evaluations then show transparent photos on white, as published numbers of NeRF-synthetic are."""
         if setting == "random" or (setting == "auto" and transparent):
             return cls(None, WHITE if transparent else BLACK)
         color = BLACK if setting == "auto" else parse_color(setting)
@@ -81,11 +76,10 @@ class Look:
 
 
 def interpolated_exposures(offsets: Tensor, trained: Sequence[str], photos: Sequence[str]) -> Tensor:
-    """[W, 3, 4] float32, ``A | b`` of photos: the mean of their neighbours', times how well it tells exposures.
-
-    How well is measured on the training photos between two others: the slope of the least squares of their exposures
-    against their neighbours' mean, within 0 .. 1. It is nearly 1 where exposures follow the sequence, and 0, which
-    gives the identity, where they differ at random, as in a collection of many people's photos.
+    """[W, 3, 4] float32, ``A | b`` of photos: the mean of their neighbours', times how well it tells exposures: the
+    slope, within 0 .. 1, of the least squares of exposures of training photos between two others against their
+    neighbours' mean. It is nearly 1 where exposures follow the sequence, and 0, which gives the identity, where they
+    differ at random, as in a collection of many people's photos.
 
     Args:
         offsets: [V, 3, 4], of the training photos (`turbogs_plugin.engine.exposures.Exposures`).

@@ -1,12 +1,8 @@
-"""The loop of all training: for runs, the cells of a study, calibration, and models that are timed.
-
-A pace sets marks, iterations at which the loop stops to do something else; a clock measures the training between them.
-Everything else in a training is a listener of the loop: evaluations, checkpoints, progress, records, stops.
-"""
+"""The loop of all training. A pace sets marks, iterations where the loop stops to do something else; a clock measures
+the training between them. Everything else is a listener: evaluations, checkpoints, progress, records, stops."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from signal import SIGTERM
 
 from turbogs_plugin.distributed.ranks import ONE, Ranks
@@ -39,21 +35,12 @@ class TrainingLoop:
 
     Args:
         pace: where to stop on the way, and where to end; None: after the configured iterations.
-        listeners: called in this order.
         ranks: the processes that train the model; each has such a loop, and the first one's clock counts.
     """
 
-    def __init__(
-        self,
-        trainer: Trainer,
-        pace: Pace | None = None,
-        listeners: Iterable[Listener] = (),
-        seconds: float = 0.0,
-        ranks: Ranks = ONE,
-    ) -> None:
-        self.trainer = trainer
-        self.pace = pace or Pace(trainer.config.train)
-        self.listeners = list(listeners)
+    def __init__(self, trainer: Trainer, pace: Pace | None = None, seconds: float = 0.0, ranks: Ranks = ONE) -> None:
+        self.trainer, self.pace = trainer, pace or Pace(trainer.config.train)
+        self.listeners: list[Listener] = []  # called in this order
         self.clock = TrainingClock(trainer.device, seconds)
         self.ranks, self.stopped = ranks, False
 

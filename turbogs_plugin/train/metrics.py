@@ -1,9 +1,5 @@
-"""Test errors of a model: PSNR, SSIM, mean absolute error, LPIPS if wanted and there; rendering speed; and the
-evaluations of a training.
-
-Where views have masks, errors are of the pixels that are not masked. Where photos have exposures of their own, a test
-view is shown with the exposure that is known of it, and errors of the model's own colours are given beside.
-"""
+"""Test errors of a model, and the evaluations of a training. Where views have masks, errors are of the pixels that are
+not masked. Where photos have exposures of their own, a test view is shown with the exposure that is known of it."""
 
 from __future__ import annotations
 
@@ -151,10 +147,8 @@ def ssim(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def _blurred(images: Tensor) -> Tensor:
-    """[B, 3, H, W] images under the window, which is a product: down the columns first, then along the rows.
-
-    Shifted sums, not a convolution: these need no library that is loaded for them.
-    """
+    """[B, 3, H, W] images under the window, which is a product: down the columns first, then along the rows; by shifted
+    sums, as a convolution loads a library."""
     margin = SSIM_SIDE // 2
     weights = [math.exp(-0.5 * (place / SSIM_SIGMA) ** 2) for place in range(-margin, margin + 1)]
     padded = F.pad(images, (margin,) * 4, mode="reflect")
@@ -171,11 +165,15 @@ def _blurred(images: Tensor) -> Tensor:
 class Evaluations(Listener):
     """Evaluates the model on test views, on its device, and passes the result to all listeners.
 
+    Args:
+        callback: called with the result, too.
+
     Attributes:
         metrics: errors of the newest evaluation; None where this process made none.
     """
 
     test: PosedImages
+    callback: Callable[[Evaluation], object] | None = None
     history: list[Evaluation] = field(default_factory=list, init=False)
     metrics: Metrics | None = field(default=None, init=False)
 
@@ -200,5 +198,7 @@ class Evaluations(Listener):
             **mean.further(),
         )
         self.history.append(evaluation)
+        if self.callback is not None:
+            self.callback(evaluation)
         for listener in loop.listeners:
             listener.evaluated(loop, evaluation)

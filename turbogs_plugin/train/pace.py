@@ -1,8 +1,4 @@
-"""The clock of training, and the pace of a run: how far it goes and where it stops, by iterations or by time.
-
-A time budget makes the run as long as ``seconds left / seconds of an iteration``: before it by a few iterations that
-are timed and thrown away, then at each look at the clock.
-"""
+"""The clock of training, and the pace of a run: how far it goes and where it stops, by iterations or by time."""
 
 from __future__ import annotations
 
@@ -51,19 +47,17 @@ class TrainingClock:
     @contextmanager
     def stopped(self) -> Iterator[None]:
         """Within the clock's own context: time spent inside is not training and does not count."""
-        synchronize(self.device)
-        began = time.perf_counter()
+        self.__exit__()
         try:
             yield
         finally:
-            self._started += time.perf_counter() - began
+            self.__enter__()
 
 
 class Pace:
-    """A fixed number of iterations, or as many as fit into a time.
-
-    With a time, everything that depends on progress (learning rates, sampling, density control, evaluations) ends with
-    it: T (`iterations`) and the end of density control (`refine_until`) follow the seconds of an iteration.
+    """A fixed number of iterations, or as many as fit into a time: ``seconds left / seconds of an iteration`` at each
+    look at the clock. With a time, T (`iterations`) and the end of density control (`refine_until`) follow it, and so
+    does everything that depends on progress (learning rates, sampling, density control, evaluations).
 
     Args:
         train: settings of the run. With a time, its iterations and its end of density control are the first guess.

@@ -18,18 +18,13 @@ AVERAGE_EVERY = 4
 
 
 class ParameterMean:
-    """The mean of tensors, by name, over the iterations that were added since it began.
-
-    For any trainer: ask `due` after each iteration, `add` where it is; `restart` where rows are of other Gaussians; and
-    `overwrite` at the end.
+    """The mean of tensors, by name, over the `count` iterations that were added since it began: `tensors`, without rows
+    where there is none. For any trainer: ask `due` after each iteration, `add` where it is; `restart` where rows are of
+    other Gaussians; and `overwrite` at the end.
 
     Args:
         share: of a run's iterations, at its end, that count.
         tensors: of the present iteration, for their layout alone. A mapping, such as gsplat's splats.
-
-    Attributes:
-        count: iterations that were added.
-        tensors: their mean; without rows where there is none.
     """
 
     def __init__(self, share: float, tensors: Mapping[str, Tensor]) -> None:
@@ -63,8 +58,8 @@ class ParameterMean:
 
     @torch.no_grad()
     def overwrite(self, tensors: Mapping[str, Tensor]) -> None:
-        """Write the mean, if there is one, into the tensors whose mean it is, and begin anew. Raises torch's
-        `RuntimeError` where they have other rows."""
+        """Write the mean, if there is one, into the tensors, and begin anew. Raises torch's `RuntimeError` where they
+        have other rows."""
         if self.count:
             for name, mean in self.tensors.items():
                 tensors[name].copy_(mean)

@@ -1,39 +1,46 @@
-"""A run and its folder: training with evaluations and checkpoints, new or resumed, up to a saved model."""
+"""Training: in memory, by `fit`; or as a run in a folder, new or resumed, with checkpoints, up to a saved model."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from turbogs_plugin.captures.bundle_adjustment import refine_cameras
 from turbogs_plugin.captures.load import holds_photos_alone
-from turbogs_plugin.config.configuration import Config, resolve
+from turbogs_plugin.config.components import KINDS, completed
+from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, resolve
 from turbogs_plugin.device import free_bytes
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine.layout import MAX_VIEWS
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.errors import InputError, nearest
 from turbogs_plugin.files import require_writable, write_text_atomically
+from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.plan import Plan, make_plan
 from turbogs_plugin.plan.memory import hold_to_limit, most_views, room_note, within_memory
 from turbogs_plugin.plan.photo_gains import PhotoGains
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.clock import WallClock
-from turbogs_plugin.train.history import rewind_history
+from turbogs_plugin.train.history import Evaluation, rewind_history
 from turbogs_plugin.train.inputs import cpu_note, open_scene, open_started, require_device, resolve_device
 from turbogs_plugin.train.loop import TrainingLoop
+from turbogs_plugin.train.metrics import Evaluations, Metrics
 from turbogs_plugin.train.pace import Pace, fitted_to_time
 from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.train.saved_model import require_model
-from turbogs_plugin.train.session import Report, RunSession, Watch
+from turbogs_plugin.train.session import Report, RunSession, TrainingProgress, Watch
 from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.types import Gaussians
 
-IMPORTS, CAMERAS = "interpreter and imports", "cameras of photos alone"
-"""Parts of the wall time before photos are decoded."""
+IMPORTS = "interpreter and imports"
+"""The first part of the wall time."""
 
 
 def plan_run(config: Config, processes: int = 1) -> Plan:
@@ -48,7 +55,7 @@ def plan_run(config: Config, processes: int = 1) -> Plan:
 def new_loop(
     config: Config, scene: Scene, device: torch.device, ranks: Ranks = ONE, gains: PhotoGains | None = None
 ) -> TrainingLoop:
-    """A training that has not begun, within its budgets. Runs and the cells of studies both begin here.
+    """A training that has not begun, within its budgets.
 
     Args:
         config: decided (`Plan.apply`). The trainer gets it with the cap and the iterations that keep the budgets.
@@ -72,6 +79,79 @@ def new_loop(
     return TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), seconds=seconds, ranks=ranks)
 
 
+@dataclass(repr=False)
+class Fit:
+    """A finished training.
+
+    Args:
+        gaussians: the model, on the device of the training and in the scene's coordinates.
+        config: what the training went by, decided by the plan.
+        history: the evaluations on the test views, the last one at the end.
+        metrics: errors of each test view at the end.
+    """
+
+    gaussians: Gaussians
+    scene: Scene
+    config: Config
+    history: list[Evaluation]
+    metrics: Metrics
+
+    def save(self, path: Path | str) -> None:
+        """Write the model as a .ply in the capture's own coordinates."""
+        save_ply(self.gaussians, Path(path), self.scene.frame)
+
+    def __repr__(self) -> str:
+        end = self.history[-1]
+        return f"Fit of {self.scene!r}: {self.gaussians!r}, {end.psnr:.2f} dB after {end.train_seconds:.1f} s"
+
+
+def fit(
+    scene: Scene | Path | str,
+    *overrides: str,
+    config: str | Path | Mapping[str, Any] = DEFAULT_CONFIG,
+    callback: Callable[[Evaluation], object] | None = None,
+    progress: bool = False,
+    **strategies: Any,
+) -> Fit:
+    """Train in memory: nothing is written.
+
+    Args:
+        scene: a loaded one, its photos in host memory; or the folder of a capture, which the section `scene` of the
+            configuration says how to read.
+        overrides: changes of the configuration, ``section.key=value``, as ``"train.iterations=500"``.
+        config: name of a packaged configuration, a YAML file, or a mapping like that of a YAML.
+        callback: called with each evaluation (`train.evaluate_at`).
+        progress: show a line for each evaluation on stderr, and on a terminal the seconds left.
+        strategies: objects in the place of those that the configuration names, by kind: ``pixel_sampler=MySampler()``.
+
+    Raises:
+        InputError: anything wrong with the input.
+        TrainingStopped: the training cannot go on.
+    """
+    for kind in strategies:
+        if kind not in KINDS:
+            raise InputError(f"fit: unknown kind of strategy '{kind}': {nearest(kind, KINDS)}")
+    settings = load_config(config if isinstance(config, Mapping) else str(config), overrides)
+    device, refine = resolve_device(settings.train.device), settings.train.refine_cameras
+    if isinstance(scene, Scene):
+        scene = refine_cameras(scene, refine)
+    else:
+        scene = open_scene(replace(settings.scene, path=str(scene)), refine)
+    plan = make_plan(settings, scene, device)
+    loop = new_loop(plan.apply(settings), scene, device, gains=plan.facts.gains)
+    for kind, strategy in strategies.items():
+        loop.trainer.take(kind, completed(kind, strategy, f"fit: {type(strategy).__name__}"))
+    trained = loop.trainer.config
+    evaluations = Evaluations(place_views(scene.test, device, trained.train.pixels_place), callback)
+    loop.listeners = [evaluations]
+    with closing(TrainingProgress()) as shown:
+        if progress:
+            loop.listeners.append(shown)
+        loop.run()
+    assert evaluations.metrics is not None
+    return Fit(loop.trainer.gaussians, scene, trained, evaluations.history, evaluations.metrics)
+
+
 def train(
     config: Config,
     out: Path,
@@ -86,7 +166,6 @@ def train(
         report: called with the finished run; `turbogs_plugin.report.run_report.write_report` writes its page.
         clock: of the wall; None: it begins now.
         ranks: the processes that train this model together; each calls this, and the first one writes and prints.
-        watch: further listeners.
 
     Raises:
         InputError: anything wrong with the input; then nothing was written.
@@ -102,7 +181,7 @@ def train(
         require_model(config.train.init)  # before minutes of photos
     posed = ranks.agree(_posed_capture(config, out) if ranks.first else "")
     if posed != config.scene.path:
-        clock.mark(CAMERAS)
+        clock.mark("cameras of photos alone")
         config = replace(config, scene=replace(config.scene, path=posed))
     scene, device = open_started(config, clock, ranks)
     plan = make_plan(config, scene, device, ranks.count)
@@ -133,11 +212,8 @@ def resume(
     trusted: bool = False,
 ) -> RunSession:
     """Go on with a stopped run from its newest checkpoint, with its own configuration, in which nothing is `auto`. On a
-    CPU, the result is bit for bit that of a run never stopped; `TrainingState.state_dict` says why.
-
-    Args:
-        report, clock, ranks, watch: as in `train`. The number of processes may be another than before.
-        trusted: as for `resolve_complete`.
+    CPU, the result is bit for bit that of a run never stopped; `TrainingState.state_dict` says why. Arguments as of
+    `train` and `resolve_complete`; the number of processes may be another than before.
 
     Raises:
         InputError: no run there, a finished one without checkpoints, an unusable checkpoint, a changed capture, or a
@@ -151,26 +227,21 @@ def resume(
     require_device(config.train.device)
     require_writable(folder.path, f"what --resume {folder.path} writes")
     with folder.owned() if ranks.first else nullcontext():
-        return _resumed(folder, config, clock, ranks).run(report, watch)
-
-
-def _resumed(folder: RunFolder, config: Config, clock: WallClock, ranks: Ranks) -> RunSession:
-    """The session of a run as its newest checkpoint has it. Errors as of `resume`."""
-    checkpoint, model = latest_checkpoint(folder.checkpoints), folder.model
-    if checkpoint is None and model.is_file():
-        raise InputError(f"'{folder.path}' is finished and has no checkpoint to go on from: use its {model.name}")
-    state = None if checkpoint is None else load_checkpoint(checkpoint)
-    scene, device = open_started(config, clock, ranks, trained=True)
-    hold_to_limit(config, device)
-    with _fitting(scene):
-        trainer = Trainer(config, scene, device, ranks.engine(device), resuming=state is not None)
-        loop = TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), ranks=ranks)
-        session = RunSession(folder, scene, loop, clock)
-        if state is not None:
-            session.load_state_dict(state, str(checkpoint))
-    if ranks.first:
-        session.history += rewind_history(folder.history, loop.trainer.iteration if session.resumed else -1)
-    return session
+        checkpoint, model = latest_checkpoint(folder.checkpoints), folder.model
+        if checkpoint is None and model.is_file():
+            raise InputError(f"'{folder.path}' is finished and has no checkpoint to go on from: use its {model.name}")
+        state = None if checkpoint is None else load_checkpoint(checkpoint)
+        scene, device = open_started(config, clock, ranks, trained=True)
+        hold_to_limit(config, device)
+        with _fitting(scene):
+            trainer = Trainer(config, scene, device, ranks.engine(device), resuming=state is not None)
+            loop = TrainingLoop(trainer, Pace(config.train, config.budget.seconds()), ranks=ranks)
+            session = RunSession(folder, scene, loop, clock)
+            if state is not None:
+                session.load_state_dict(state, str(checkpoint))
+        if ranks.first:
+            session.history += rewind_history(folder.history, trainer.iteration if session.resumed else -1)
+        return session.run(report, watch)
 
 
 def _posed_capture(config: Config, out: Path) -> str:

@@ -7,7 +7,7 @@ import shutil
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from turbogs_plugin.config.configuration import Config, resolve_complete
@@ -46,7 +46,8 @@ class RunFolder:
     def owned(self, new: bool = False) -> Iterator[None]:
         """The folder, which is made where it is `new`, is this process's alone while entered. A line on stderr tells of
         an owner that was killed, whose lock the system has freed, and of a disk that knows no locks. Raises
-        `InputError` where another process writes to it, or has written to a new one meanwhile."""
+        `InputError` where another process writes to it, or has written to a new one meanwhile. A new one that ends by
+        an `InputError`, from a strategy of one's own, say, before its first checkpoint is removed."""
         from filelock import FileLock, Timeout  # of the extra `train`
 
         self.path.mkdir(parents=new, exist_ok=True)
@@ -65,28 +66,19 @@ class RunFolder:
                 raise InputError(f"--out '{self.path}' is not empty: another process has written to it meanwhile")
             if before := read_text(self.owner):
                 print(f"turbogs: {before[:80]} was killed: '{self.path}' is taken over from it", file=sys.stderr)
-            if new:
-                self._clear()
+            if new:  # what a run that failed has left
+                for file in (self.config, self.history):
+                    file.unlink(missing_ok=True)
+                shutil.rmtree(self.tensorboard, ignore_errors=True)
             write_text_atomically(self.owner, f"process {os.getpid()} of {socket.gethostname()}")
             yield
+        except InputError:
+            if new and self._unclaimed():
+                shutil.rmtree(self.path, ignore_errors=True)
+            raise
         finally:
             self.owner.unlink(missing_ok=True)
             lock.release()
-
-    def discard(self) -> None:
-        """Remove what a run wrote that never came to a checkpoint, and the folder if nothing else is in it."""
-        self._clear()
-        self.owner.unlink(missing_ok=True)
-        self.lock.unlink(missing_ok=True)
-        with suppress(OSError):  # there is something else
-            self.path.rmdir()
-
-    def _clear(self) -> None:
-        for entry in self._begun:
-            if entry.is_dir() and not entry.is_symlink():
-                shutil.rmtree(entry)
-            else:
-                entry.unlink(missing_ok=True)
 
     def finished(self, reported: bool) -> bool:
         """Whether the run's model, which is written at the end, is there, and its report if that is `reported`."""

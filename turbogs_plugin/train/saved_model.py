@@ -1,9 +1,5 @@
-"""Models to render, measure, hand over or start from: a run's newest one, or one that was trained anywhere.
-
-A model from a file is taken to be in its capture's own coordinates, or where its points lie by nerfstudio's file beside
-it (`turbogs_plugin.model.placement`). gsplat's example trainer works in others unless it is told not to;
-`train.init_world` says which.
-"""
+"""Models to render, measure, hand over or start from: a run's newest one, or one that was trained anywhere, which is in
+its capture's own coordinates, in nerfstudio's by the file beside it, or in gsplat's by `train.init_world`."""
 
 from __future__ import annotations
 
@@ -46,9 +42,8 @@ _SAVED = ("checkpoints/iteration-*.pt", "point_cloud/iteration_*/point_cloud.ply
 
 @dataclass
 class SavedModel:
-    """The parts of a run needed to render or export its model; or a model from a file, whose `folder`, `iteration` and
-    `exposures` are None, and which may be `antialiased` (`render_image`). `exposures`: [V, 3, 4] of training photos, if
-    learnt."""
+    """The parts of a run needed to render or export its model, with `exposures` [V, 3, 4] of training photos if learnt;
+    or a model from a file, without `folder` and `iteration`, which may be `antialiased` (`render_image`)."""
 
     folder: RunFolder | None
     config: Config
@@ -81,17 +76,14 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
         raise InputError(f"'{path}' has no checkpoint: let the run go on with --resume, or give its model and --scene")
     state = load_checkpoint(checkpoint)
     try:
-        trained = state["trainer"]
-        gaussians = read_gsplat({"splats": trained["gaussians"]}, checkpoint)
-        gaussians = gaussians.map(lambda value: value.float().to(device))
-        if not gaussians.finite_rows().all():
-            raise ValueError("its Gaussians are not finite")
+        trained, iteration = state["trainer"], operator.index(state["trainer"]["iteration"])
+        loaded = read_gsplat({"splats": trained["gaussians"]}, checkpoint)
+        gaussians = loaded.map(lambda value: value.float().to(device))
         exposures = trained["exposures"]["offsets"].to(device) if config.train.exposure is True else None
+        if not (gaussians.finite_rows().all() and 0 <= iteration < COUNT_LIMIT):
+            raise ValueError("its Gaussians are not finite, or its iteration is none")
         if exposures is not None and not (exposures.shape[1:] == (3, 4) and exposures.isfinite().all()):
             raise ValueError("its exposures are none")
-        iteration = operator.index(trained["iteration"])
-        if not 0 <= iteration < COUNT_LIMIT:
-            raise ValueError("its iteration is none")
         return SavedModel(folder, config, gaussians, Frame(**state["frame"]), iteration, exposures)
     except (KeyError, TypeError, AttributeError, IndexError, ValueError, RuntimeError) as error:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
@@ -100,9 +92,8 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
 def load_with_capture(
     path: Path, given: Config | None, device: torch.device, needed: bool = True
 ) -> tuple[SavedModel, Scene | None, str]:
-    """The newest model of a run, or a model as `require_model` takes it, whose capture and rendering are `given`; its
-    capture; and why that is None: it is not there, and not `needed`. Raises `InputError`: no such model, or no usable
-    capture where it is needed."""
+    """The newest model of a run, or a model's file, whose capture and rendering are `given`; its capture; and why that
+    is None: it is not there, and not `needed`. Raises `InputError`: no such model, or no usable capture if needed."""
     if given is not None:
         require_model(path)  # before its capture is read
         scene = open_scene(given.scene, given.train.refine_cameras)
@@ -129,13 +120,18 @@ def require_model(path: str | Path) -> Path:
         return max(found, key=lambda file: [int(number) for number in re.findall(r"\d+", str(file.relative_to(path)))])
     if not path.is_file():
         raise InputError(f"no such model '{path}': give {KINDS}")
-    kind = path.suffix.lower().removeprefix(".")
-    others = {other: remedy for kinds, remedy in _OTHERS.items() for other in kinds.split()}
-    if kind in others:
-        raise InputError(f"'{path}' is a .{kind}, which is not read: {others[kind].format(path)}")
+    kind = kind_of(path)
+    for kinds, remedy in _OTHERS.items():
+        if kind in kinds.split():
+            raise InputError(f"'{path}' is a .{kind}, which is not read: {remedy.format(path)}")
     if kind not in FORMATS:
         raise InputError(f"'{path}' is no model: give {KINDS}")
     return path
+
+
+def kind_of(file: Path) -> str:
+    """The suffix of a file, as of `FORMATS`."""
+    return file.suffix.lower().removeprefix(".")
 
 
 def load_given(path: str | Path, scene: Scene, world: str = "capture") -> tuple[Gaussians, bool]:
@@ -161,12 +157,10 @@ def _to_capture(gaussians: Gaussians, path: Path, scene: Scene, world: str) -> S
         viewmats = scene.frame.restore_poses(views.numpy())  # [V, 4, 4], in the capture's own coordinates
         changes = [change.inverse() for change in gsplat_worlds(viewmats, points)]
         if not changes:
-            raise InputError(
-                f"{path}: the cameras and points of {scene.name} do not determine gsplat's normalised world: train the "
-                "model with --no-normalize-world-space, and leave train.init_world out"
-            )
+            remedy = "train the model with --no-normalize-world-space, and leave train.init_world out"
+            raise InputError(f"{path}: {scene.name} does not determine gsplat's normalised world: {remedy}")
     else:
-        turns = [np.eye(3), *([np.diag([-1.0, 1.0, -1.0])] if path.suffix.lower() == ".spz" else [])]
+        turns = [np.eye(3), np.diag([-1.0, 1.0, -1.0])][: 2 if kind_of(path) == "spz" else 1]
         origins = dict.fromkeys(map(tuple, (np.zeros(3), local_origin(scene.frame))))
         changes = out_of_nerfstudio(path)
         changes += [Similarity(turn, 1.0, np.array(origin)) for turn in turns for origin in origins]
@@ -174,11 +168,9 @@ def _to_capture(gaussians: Gaussians, path: Path, scene: Scene, world: str) -> S
         return changes[0]
     change, fits = nearest_change(gaussians, changes, points, scene.point_colors.cpu().numpy())
     if not fits:
-        warnings.warn(
-            f"{path} does not fit the points of {scene.name}: it is of another capture or in other coordinates; say "
-            f"train.init_world=gsplat for gsplat's normalised ones, or put nerfstudio's {TRANSFORMS} beside it",
-            stacklevel=3,
-        )
+        said = f"{path} does not fit the points of {scene.name}: it is of another capture or in other coordinates"
+        remedy = f"say train.init_world=gsplat for gsplat's normalised ones, or put nerfstudio's {TRANSFORMS} beside it"
+        warnings.warn(f"{said}; {remedy}", stacklevel=3)
     return change
 
 
@@ -187,9 +179,8 @@ def read_given(path: str | Path) -> tuple[Gaussians, bool, Similarity | None]:
     whether it is drawn with antialiasing; and the change to its capture's own coordinates where the file knows it.
     Errors as of `require_model`."""
     file = require_model(path)
-    kind = file.suffix.lower().removeprefix(".")
-    if kind != "pt":
-        return *FORMATS[kind][1](file), None
+    if kind_of(file) != "pt":
+        return *FORMATS[kind_of(file)][1](file), None
     state = read_plain(file, f"'{file}'", REMEDY)
     if isinstance(state, Mapping) and "splats" in state:
         of_ranks = re.compile(re.sub(r"_rank\d+$", r"_rank\\d+", re.escape(file.stem)))  # with several, each has a part
@@ -202,6 +193,5 @@ def read_given(path: str | Path) -> tuple[Gaussians, bool, Similarity | None]:
         return gaussians, False, Similarity.into(Frame(**state["frame"])).inverse()
     except (KeyError, TypeError):
         keys = ", ".join(sorted(map(str, state))[:6]) if isinstance(state, Mapping) else type(state).__name__
-        raise InputError(
-            f"{file} is neither gsplat's checkpoint (step, splats) nor one of TurboGS (it has {keys}): give {KINDS}"
-        ) from None
+        said = f"{file} is neither gsplat's checkpoint (step, splats) nor one of TurboGS (it has {keys})"
+        raise InputError(f"{said}: give {KINDS}") from None

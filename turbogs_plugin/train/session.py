@@ -70,11 +70,9 @@ class RunSession(Listener):
 
     Attributes:
         test: the test views, on the trainer's device.
-        history: every evaluation of the run.
         resumed: whether the trainer's state was loaded.
         signal: the signal that stopped the training; None at the end of the run.
-        clock: of the wall, in this process.
-        wall: what is recorded of it when the model is written.
+        wall: what is recorded of the `clock` when the model is written.
     """
 
     def __init__(self, folder: RunFolder, scene: Scene, loop: TrainingLoop, clock: WallClock) -> None:
@@ -115,20 +113,15 @@ class RunSession(Listener):
             write_text_atomically(self.folder.wall, json.dumps(asdict(self.wall), indent=1) + "\n")
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
-        except InputError:  # in an iteration: from a strategy of one's own, say
-            if ranks.first and latest_checkpoint(self.folder.checkpoints) is None:
-                self.folder.discard()
-            raise
         except torch.cuda.OutOfMemoryError as error:
-            raise TrainingStopped(
-                f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)} "
-                f"Gaussians; try --max-gaussians {round(0.7 * len(trainer.gaussians))}; {self._last_good()}"
-            ) from error
+            said = f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)}"
+            remedy = f"try --max-gaussians {round(0.7 * len(trainer.gaussians))}"
+            raise TrainingStopped(f"{said} Gaussians; {remedy}; {self._last_good()}") from error
         return self
 
     def _train(self) -> None:
-        """Train to the end or a signal. Where the device's memory, which others may share, is full on the way, training
-        goes on once from the newest checkpoint, with memory of passes sized anew and what is unused given back."""
+        """Train to the end or a signal; once more from the newest checkpoint where the device's memory, which others
+        may share, is full on the way, with memory of passes sized anew."""
         try:
             return self.loop.run(self.resumed)
         except torch.cuda.OutOfMemoryError:
@@ -187,11 +180,9 @@ class RunSession(Listener):
         except (KeyError, TypeError, AttributeError, IndexError, ArithmeticError, RuntimeError, ValueError) as error:
             raise InputError(f"checkpoint '{source}' does not fit this run and its capture: {error}") from None
         if difference:
-            path = self.trainer.config.scene.path
-            raise InputError(
-                f"capture '{path}' has {difference} than when the run in '{self.folder.path}' began: "
-                "bring that state of it back, or train anew with another --out"
-            )
+            path, run = self.trainer.config.scene.path, self.folder.path
+            changed = f"capture '{path}' has {difference} than when the run in '{run}' began"
+            raise InputError(f"{changed}: bring that state of it back, or train anew with another --out")
 
     def _save(self) -> None:
         """Write a checkpoint. Raises `TrainingStopped` for a model that is not finite, or where the disk refused."""

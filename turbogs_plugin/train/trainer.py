@@ -1,31 +1,21 @@
-"""Algorithm 1 of the paper: one iteration of training.
-
-The state that iterations change is in `turbogs_plugin.train.training_state`, the loop over iterations in
-`turbogs_plugin.train.loop`.
-"""
+"""Algorithm 1 of the paper: one iteration of training. `turbogs_plugin.train.loop` is the loop over iterations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from turbogs_plugin.captures.depth_maps import depth_maps
-from turbogs_plugin.config.configuration import Config
-from turbogs_plugin.engine import Engine, engine_of
 from turbogs_plugin.engine.exposures import exposure_rate
 from turbogs_plugin.engine.protocol import MapUpdate
 from turbogs_plugin.engine.render_pass import RenderOptions, ScreenGradients
 from turbogs_plugin.engine.rules import Dropout
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.model.limits import RESTRAIN_EVERY, Clearance, restrain_distant
+from turbogs_plugin.model.limits import RESTRAIN_EVERY, restrain_distant
 from turbogs_plugin.model.row_order import in_order_of_space
-from turbogs_plugin.plan.photo_gains import PhotoGains
-from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.depths import DepthPair, InverseDepths
+from turbogs_plugin.scene.depths import DepthPair
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.train.training_state import TrainingState
 from turbogs_plugin.types import GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
@@ -35,34 +25,10 @@ DROPOUT_UNTIL = 0.95
 
 
 class Trainer(TrainingState):
-    """The iterations of one run. Arguments as of `TrainingState`; no engine stands for the device's own (`engine_of`).
+    """The iterations of one run. Arguments as of `TrainingState`."""
 
-    Attributes:
-        on_samples: called with the samples of each iteration, if anything; it must be cheap, and change nothing.
-    """
-
-    def __init__(
-        self,
-        config: Config,
-        scene: Scene,
-        device: torch.device,
-        engine: Engine | None = None,
-        gains: PhotoGains | None = None,
-        resuming: bool = False,
-    ) -> None:
-        config.require_decided()
-        super().__init__(config, scene, device, engine or engine_of(device, for_training=True), gains, resuming)
-        self.schedule = config.build("schedule")
-        self.pixel_sampler = config.build("pixel_sampler")
-        self.loss = config.build("loss")
-        self.depths: InverseDepths | None = None
-        if self.loss.terms is not None and self.loss.terms.depth_weight > 0:
-            maps = depth_maps(Path(config.scene.path), scene.train, scene.frame.scale)
-            self.depths = InverseDepths.of(scene.train.cameras, scene.train.observations, scene.points, maps).to(device)
-        self.clearance: Clearance | None = None
-        if config.train.camera_clearance and not scene.drawn_points:
-            self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)
-        self.on_samples: Callable[[PixelSamples], None] | None = None
+    on_samples: Callable[[PixelSamples], None] | None = None
+    """Called with the samples of each iteration, if anything; it must be cheap, and change nothing."""
 
     def step(self) -> None:
         """One iteration, in the paper's order."""
@@ -148,7 +114,7 @@ class Trainer(TrainingState):
         (mcmc's noise) is taken back in a skipped iteration, which is made again (`Engine.overflow`)."""
         due, overflow = self.density.event_due(step), self.engine.overflow
         if due:
-            self.engine.complete(self.optimizer.moments, self.density.stats)
+            self.engine.complete()
         before = self.gaussians.map(Tensor.clone) if overflow is not None and self.density.moves_model else None
         update = self.density.update(self.gaussians, step)
         if overflow is not None and before is not None and update is None:
@@ -176,10 +142,8 @@ def require_samples(samples: PixelSamples, view_ids: Sequence[int], name: str) -
     """Raise `InputError` unless `samples` of the pixel sampler `name` are of these views, in this order, whose renders
     are compared with their photos and error maps."""
     if samples.view_ids != tuple(view_ids):
-        raise InputError(
-            f"pixel_sampler.type '{name}' returned samples of views {samples.view_ids}, asked for {tuple(view_ids)}: "
-            "give view_ids to PixelSamples, or to from_mask"
-        )
+        said = f"pixel_sampler.type '{name}' returned samples of views {samples.view_ids}, asked for {tuple(view_ids)}"
+        raise InputError(f"{said}: give view_ids to PixelSamples, or to from_mask")
 
 
 def require_output(output: LossOutput, colors: Tensor, name: str) -> None:

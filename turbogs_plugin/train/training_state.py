@@ -1,29 +1,32 @@
-"""What iterations of training change: the model, the error maps and the state of the strategies; and what is done with
-it as a whole: it is begun, saved and loaded, made complete, taken back where an engine had too little memory, shown."""
+"""What iterations of training change: the model, the error maps and the state of the strategies."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from turbogs_plugin.captures.depth_maps import depth_maps
 from turbogs_plugin.captures.starting_points import colors_in_photos, plain_cloud, starting_points
 from turbogs_plugin.config.configuration import Config
-from turbogs_plugin.engine import Engine
+from turbogs_plugin.engine import Engine, engine_of
 from turbogs_plugin.engine.exposures import Exposures
 from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.model.initial import BACKDROP_COUNT, backdrop_gaussians, gaussians_from_points, with_degree
+from turbogs_plugin.model.limits import Clearance
 from turbogs_plugin.model.torch_file import read_gsplat
 from turbogs_plugin.plan.memory import cap_of
 from turbogs_plugin.plan.photo_gains import PhotoGains, compare_exposures
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.agreement import require_agreement
+from turbogs_plugin.scene.depths import InverseDepths
 from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.scene.offload import OffloadedErrorMaps, place_views
 from turbogs_plugin.train.look import Background, Look, interpolated_exposures
@@ -34,7 +37,7 @@ from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
 STATEFUL = ("maps", "view_sampler", "optimizer", "density")
 """Attributes that have a state of their own."""
 COLOR_STRIDE = 97
-"""The mean colour of the photos is taken over every 97th pixel; coprime to usual widths."""
+"""Pixels from one that counts to the next in the mean colour of the photos; coprime to usual widths."""
 
 
 class TrainingState:
@@ -44,15 +47,13 @@ class TrainingState:
         config: the run's, in which nothing is ``auto`` any more.
         scene: on any device.
         device: where everything is computed and kept.
-        engine: does the computation.
+        engine: does the computation; None: the device's own (`engine_of`).
         gains: the photos', as a plan has compared them; None: compared here, where exposures are learnt.
         resuming: a state is loaded next, so that the model of `train.init` need not be there.
 
     Attributes:
         gaussians: the model; iterations change it in place, so clone what is to be kept.
         maps: the error maps of the training views, `views`.
-        exposures: the photos', where they are learnt.
-        parameter_mean: over the last iterations, where one is wanted.
         iteration: how many are finished; `iterations` is T, and `refine_until` the last one of densification.
     """
 
@@ -61,12 +62,14 @@ class TrainingState:
         config: Config,
         scene: Scene,
         device: torch.device,
-        engine: Engine,
-        gains: PhotoGains | None,
-        resuming: bool,
+        engine: Engine | None = None,
+        gains: PhotoGains | None = None,
+        resuming: bool = False,
     ) -> None:
+        config.require_decided()
         train = config.train
-        self.config, self.engine, self.extent = config, engine, scene.extent
+        self.config, self.extent = config, scene.extent
+        self.engine = engine or engine_of(device, for_training=True)
         self.views = place_views(scene.train, device, train.pixels_place)
         kind = OffloadedErrorMaps if train.pixels_place == "host" else ErrorMaps
         self.maps: ErrorMaps = kind(scene.train.cameras.sizes, device, config.maps.beta, masks=self.views.masks)
@@ -76,10 +79,17 @@ class TrainingState:
             self.exposures = Exposures.identity(len(self.views), device)
             if not resuming:
                 set_gains(self.exposures, gains or compare_exposures(scene.train, scene.points))
-        self.view_sampler = config.build("view_sampler")
-        self.optimizer = config.build("optimizer")
-        self.density = config.build("density")
+        self.view_sampler, self.pixel_sampler = config.build("view_sampler"), config.build("pixel_sampler")
+        self.optimizer, self.density = config.build("optimizer"), config.build("density")
+        self.schedule, self.loss = config.build("schedule"), config.build("loss")
         self.view_sampler.setup(self.views.cameras, scene.extent)
+        self.depths: InverseDepths | None = None
+        if self.loss.terms is not None and self.loss.terms.depth_weight > 0:
+            maps = depth_maps(Path(config.scene.path), scene.train, scene.frame.scale)
+            self.depths = InverseDepths.of(scene.train.cameras, scene.train.observations, scene.points, maps).to(device)
+        self.clearance: Clearance | None = None
+        if train.camera_clearance and not scene.drawn_points:
+            self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)
         gaussians = initial_gaussians(scene, config, "points" if resuming else train.init)
         self.begin_with(gaussians.map(lambda tensor: tensor.to(device)))
         self.parameter_mean = ParameterMean(train.average_last, self.learnt()) if train.average_last else None
@@ -89,6 +99,14 @@ class TrainingState:
         self.nonfinite_losses = torch.zeros((), dtype=torch.int64, device=device)
         self._earliest = 0  # the iteration after the latest change of the set of Gaussians: see `repeat_lost`
 
+    def take(self, kind: str, strategy: Any) -> None:
+        """Put a strategy in the place of the present one of its kind, before the first iteration."""
+        setattr(self, kind, strategy)
+        if kind == "view_sampler":
+            strategy.setup(self.views.cameras, self.extent)
+        elif kind in ("density", "optimizer"):
+            strategy.setup(self.gaussians)
+
     def begin_with(self, gaussians: Gaussians) -> None:
         """Train this model from now on, with optimizer and density control as at the start."""
         self.place(gaussians)
@@ -96,8 +114,8 @@ class TrainingState:
         self.density.setup(self.gaussians)
 
     def place(self, gaussians: Gaussians) -> None:
-        """Take this model, where the engine wants it. The present one is let go before memory for it is taken."""
-        self.gaussians = gaussians
+        """Take this model, where the engine wants it."""
+        self.gaussians = gaussians  # the present one is let go before memory for the new one is taken
         self.gaussians = self.engine.place(gaussians)
 
     def change_rows(self, update: RowUpdate) -> None:
@@ -155,7 +173,7 @@ class TrainingState:
         return {**dict(self.gaussians.items()), **exposures}
 
     def conclude(self) -> None:
-        """At the end of a run: the model becomes the mean of the last iterations, if there is one."""
+        """End a run: the model becomes the mean of the last iterations, if there is one."""
         if self.parameter_mean is not None:
             self.parameter_mean.overwrite(self.learnt())
 
@@ -169,24 +187,21 @@ class TrainingState:
     def repeat_lost(self, wait: bool = False) -> None:
         """Go back by the iterations that were skipped: where the engine has too little memory for an iteration, that
         one and those after it change nothing until the engine is settled. They are made again, with views chosen anew,
-        but for those before a change of the set of Gaussians, which would then be made twice.
-
-        `wait`: wait for the GPU, to know of all of them. Raises `InputError` where an iteration has more intersections
-        of a tile and a splat than a pass can have.
-        """
+        but for those before a change of the set of Gaussians, which would then be made twice. `wait`: for the GPU, to
+        know of all. Raises `InputError` where an iteration has more intersections than a pass can have."""
         lost, last = self.engine.settle(wait), self.iteration
         self.iteration = max(last - lost, min(self._earliest, last))
 
     def complete(self) -> None:
         """Make the whole state valid, before it is evaluated or saved. Raises `TrainingStopped` as `Engine.verify`."""
-        self.engine.complete(self.optimizer.moments, self.density.stats)
+        self.engine.complete()
         self.engine.verify(self.state_dict)
 
     def require_finite(self) -> None:
         """Raise `TrainingStopped` where a parameter is not finite, which later iterations would not repair."""
         if bad := int((~self.gaussians.finite_rows()).sum()):
-            count = len(self.gaussians)
-            raise TrainingStopped(f"iteration {self.iteration}: {bad} of {count} Gaussians are not finite")
+            share = f"{bad} of {len(self.gaussians)}"
+            raise TrainingStopped(f"iteration {self.iteration}: {share} Gaussians are not finite")
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that iterations change, as plain tensors and numbers. A resume from it is bit for bit the same on
@@ -202,9 +217,8 @@ class TrainingState:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load what `state_dict` gave, of the same configuration and scene, after `set_length`. An untrusted state must
-        first be compared with the present one (`checkpoint.require_like`). Raises `ValueError` where its parts do not
-        fit each other, or not this trainer."""
+        """Load what `state_dict` gave, of the same configuration and scene, after `set_length`; from a file, after
+        `checkpoint.require_like`. Raises `ValueError` where its parts do not fit each other, or not this trainer."""
         if not 0 <= state["iteration"] <= self.iterations or state["nonfinite_losses"] < 0:
             raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
         if state["maps"]["stamp_base"] > state["iteration"]:
@@ -229,20 +243,15 @@ def set_gains(exposures: Exposures, gains: PhotoGains) -> None:
 
 
 def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
-    """The model, on the CPU, that training starts from by `init`, which is as `train.init`: a given one, or one of the
-    capture's or another cloud's points, of which as many as the cap allows are taken, evenly in their order; and a
-    backdrop if one is wanted.
-
-    Raises:
-        InputError: the given model cannot be read, given points are not of this capture, or the cap has no room.
+    """The model, on the CPU, that training starts from by `init`, which is as `train.init`: a given one, or one of
+    points, of which as many as the cap allows are taken, evenly in their order; and a backdrop if one is wanted.
+    Raises `InputError`: `init` cannot be read or is of another capture, or the cap has no room.
     """
     train, cap = config.train, cap_of(config)
     others = BACKDROP_COUNT if train.backdrop else 0
     if cap and cap <= others:
-        raise InputError(
-            f"density.max_gaussians {cap} leaves no room beside the {others} of the backdrop: allow more, or leave the "
-            "backdrop out by train.backdrop=false"
-        )
+        remedy = "allow more, or leave the backdrop out by train.backdrop=false"
+        raise InputError(f"density.max_gaussians {cap} leaves no room beside the {others} of the backdrop: {remedy}")
     if cloud := _cloud(scene, config, init):
         points, colors = cloud
         rows = evenly(len(points), cap - others if cap else len(points))
@@ -254,10 +263,8 @@ def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
         if antialiased:
             warnings.warn(f"'{init}' is of antialiased training: it goes on without, thicker at first", stacklevel=2)
         if cap and len(gaussians) + others > cap:
-            raise InputError(
-                f"'{init}' has {len(gaussians)} Gaussians, more than density.max_gaussians {cap} allows beside "
-                f"{others} of a backdrop: allow more, or start from points"
-            )
+            said = f"'{init}' has {len(gaussians)} Gaussians, more than density.max_gaussians {cap} allows"
+            raise InputError(f"{said} beside {others} of a backdrop: allow more, or start from points")
     if not train.backdrop:
         return gaussians
     backdrop = backdrop_gaussians(_mean_color(scene.train), train.sh_degree, scene.extent)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -101,16 +101,16 @@ class CudaScreenGradients(ScreenGradients):
         )
 
 
-@dataclass
+@dataclass(repr=False)
 class CudaRendered(Rendered):
     """One forward pass (see `Rendered`). With a workspace, valid until the next pass."""
 
-    _status: Tensor = field(repr=False)  # [2] int32, of `layout.PassStatus`
-    _scene: launches.Scene = field(repr=False)
-    _workspace: Workspace | None = field(repr=False)
-    _radii: Tensor = field(repr=False)  # [K, N, 2]
-    _forward: launches.RasterForward = field(repr=False)
-    _cleared: bool = field(repr=False)  # the projection has cleared the records on screen, for one backward pass
+    _status: Tensor  # [2] int32, of `layout.PassStatus`
+    _scene: launches.Scene
+    _workspace: Workspace | None
+    _radii: Tensor  # [K, N, 2]
+    _forward: launches.RasterForward
+    _cleared: bool  # the projection has cleared the records on screen, for one backward pass
 
     @property
     def num_intersections(self) -> Tensor:

@@ -44,8 +44,8 @@ class Compositor:
     """Composites the splats of a pass, and takes gradients back to them.
 
     Args:
-        intersections: the M intersections of the T tiles.
-        samples: the P samples.
+        intersections: M, of the T tiles.
+        samples: P.
         settings: thresholds.
         table: [10, R] the splats, see `splat_table`.
     """
@@ -81,11 +81,8 @@ class Compositor:
             begin = end
 
     def slices(self) -> Iterator[tuple[Block, Tensor, Tensor, Slice]]:
-        """Every slice of every block; a block's slices come front to back, until all its pixels are opaque.
-
-        Yields:
-            The block; numbers [B, G] of the slice's intersections; which of them are real, not padding; the slice.
-        """
+        """Every slice of every block; a block's slices come front to back, until all its pixels are opaque. Yields the
+        block; numbers [B, G] of the slice's intersections; which of them are real, not padding; the slice."""
         centers = self.samples.coordinates().to(self.table.dtype) + 0.5
         centers = torch.cat([centers, centers.new_zeros(1, 2)])  # [P + 1, 2], the last of them padding
         for block in self.blocks():
@@ -103,29 +100,18 @@ class Compositor:
                     break
 
     def forward(self) -> Tensor:
-        """Composite all samples.
-
-        Returns:
-            [P, 5]: sums of weight times (red, green, blue, 1, depth). Zero in empty slots.
-        """
+        """[P, 5]: sums of weight times (red, green, blue, 1, depth) at all samples. Zero in empty slots."""
         sums = self.table.new_zeros(len(self.samples) + 1, 5)
         for block, _, _, piece in self.slices():
             sums[block.samples] = sums[block.samples].baddbmm_(piece.weights, piece.features.transpose(1, 2))
         return sums[:-1] * self.samples.filled[:, None]
 
     def backward(self, sums: Tensor, gradients: Tensor, pixel_errors: Tensor) -> Tensor:
-        """Take the gradients of `forward` to the splats.
+        """[R, 16], `layout.ScreenRecord` of the splats, from gradients [P, 5] of the result `sums` of `forward`, and
+        errors [P].
 
         The weights are composited a second time, front to back. The contribution behind a splat is the pixel's total
         minus what has been seen of it, so nothing is divided by a small transmittance.
-
-        Args:
-            sums: result of `forward`.
-            gradients: [P, 5], d loss / d sums.
-            pixel_errors: [P].
-
-        Returns:
-            [R, 16], see `layout.ScreenRecord`.
         """
         intersections, filled = self.intersections, self.samples.filled[:, None]
         # Red, green, blue, alpha, depth, error, 1. Zero in the padding slot and in empty ones.

@@ -165,12 +165,7 @@ def draw_pixels(rule: DrawRule, maps: ErrorMaps, view_ids: tuple[int, ...], rate
 
 
 def _draw_tiles(
-    errors: Tensor,
-    ages: Tensor,
-    counts: np.ndarray,
-    words: Callable[[Tensor, int], Words],
-    rate: float,
-    rule: DrawRule,
+    errors: Tensor, ages: Tensor, counts: np.ndarray, words: Callable[[Tensor, int], Words], rate: float, rule: DrawRule
 ) -> tuple[Tensor, list[int]]:
     """Positions of whole tiles, drawn from each view, among the T; the number drawn of each view. `errors`, `ages`:
     [T] of the tiles; `counts`: [K] tiles of each view; `words` gives the random words of places [T, 1]."""

@@ -7,8 +7,7 @@ All functions have one signature, ``solve(rows, damping, rhs) -> x``:
 For the blocks of Moment-LM (D = 10 and 4) `reference/update.py` uses `solve_low_rank`, and the CUDA kernel
 (`csrc/optimizer/moment_lm.cuh`) does what `solve_scaled_cholesky` does. Both first scale the system by d^(-1/2) on both
 sides. It becomes I + (something positive semi-definite), whose eigenvalues are >= 1. Its condition depends only on the
-length of the scaled rows, which can be bounded. Entries of d of very different sizes do not harm Cholesky. Damping lost
-in rounding beside long rows does, and so do squares that overflow; the scaled form has neither.
+length of the scaled rows, which can be bounded: no damping is lost in rounding beside long rows, no square overflows.
 """
 
 from __future__ import annotations

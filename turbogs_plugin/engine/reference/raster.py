@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -89,16 +89,16 @@ class ReferenceScreenGradients(ScreenGradients):
         torch.maximum(stats.max_radii, largest, out=stats.max_radii)
 
 
-@dataclass
+@dataclass(repr=False)
 class ReferenceRendered(Rendered):
     """One forward pass (see `Rendered`)."""
 
-    _sums: Tensor = field(repr=False)
-    _compositor: Compositor = field(repr=False)
-    _rows: Rows = field(repr=False)
-    _splats: Splats = field(repr=False)
-    _leaves: Gaussians = field(repr=False)
-    _background: Tensor | None = field(repr=False)  # [3]; None: black
+    _sums: Tensor
+    _compositor: Compositor
+    _rows: Rows
+    _splats: Splats
+    _leaves: Gaussians
+    _background: Tensor | None  # [3]; None: black
 
     @torch.no_grad()
     def projected(self) -> Projected:

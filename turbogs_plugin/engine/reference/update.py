@@ -14,7 +14,7 @@ from torch import Tensor
 from turbogs_plugin.engine.layout import ParameterRow
 from turbogs_plugin.engine.moments import COLUMNS, GaussianMoments
 from turbogs_plugin.engine.reference.lm_solvers import solve_low_rank
-from turbogs_plugin.engine.rules import ParameterRates, UpdateRule
+from turbogs_plugin.engine.rules import UpdateRule
 from turbogs_plugin.types import GaussianGradients, Gaussians
 
 BLOCKS = (
@@ -32,12 +32,8 @@ GRADIENT_LIMIT, SUM_LIMIT = 1e17, 1.8e19
 def apply_update(
     rule: UpdateRule, gaussians: Gaussians, gradients: GaussianGradients, moments: GaussianMoments
 ) -> None:
-    """Make one step of `rule`: changes `gaussians` and `moments` in place.
-
+    """Make one step of `rule`, by the gradients of each view or their sum: changes `gaussians` and `moments` in place.
     The higher bands make Adam's step under every rule: they are in no block (appendix, second half of the LM equation).
-
-    Args:
-        gradients: of each view, or their sum; this function sums them where the rule needs that.
     """
     finite = finite_gradients(gradients)
     moments.skipped += (gradients.touched & ~finite).sum()
@@ -48,7 +44,9 @@ def apply_update(
     rows = clipped(torch.cat(columns, dim=-1))  # [K, n, 14]
     gradient = rows.sum(dim=0).clamp(-SUM_LIMIT, SUM_LIMIT)
     terms = advance(moments.exp_avg, moments.exp_avg_sq, gradient, index, steps, rule)
-    rates = packed_rates(rule.rates, gradient)
+    rates = gradient.new_empty(ParameterRow.SIZE)
+    for name, place in COLUMNS.items():
+        rates[place] = getattr(rule.rates, name)
     if rule.kind == "adam":
         delta = adam_step(rates, *terms)
     else:
@@ -64,12 +62,6 @@ def apply_update(
     for name, change in {**changes, "shN": adam_step(rule.rates.shN, *terms)}.items():
         value = getattr(gaussians, name)
         value.index_add_(0, index, change.reshape(len(index), *value.shape[1:]))
-
-
-def packed_rates(rates: ParameterRates, like: Tensor) -> Tensor:
-    """[14] the rates in the order of a packed row, in the dtype and on the device of `like`."""
-    values = [getattr(rates, name) for name, s in COLUMNS.items() for _ in range(s.stop - s.start)]
-    return torch.tensor(values, dtype=like.dtype, device=like.device)
 
 
 def clipped(gradient: Tensor) -> Tensor:
