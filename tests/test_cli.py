@@ -139,8 +139,7 @@ def test_plan_without_a_capture_lists_the_settings(turbogs, monkeypatch, changes
 
 
 def test_incomplete_and_contradictory_calls(turbogs, capture, tmp_path):
-    assert_refused(turbogs("train"), "SCENE")
-    assert_refused(turbogs("train", capture), "--out")
+    assert_refused(turbogs("train", capture), "SCENE and --out")
     assert_refused(turbogs("train", "train.iterations=2", "--out", tmp_path / "run"), "no such scene")
     for other in ([capture], ["--device", "cpu"]):
         assert_refused(turbogs("train", *other, "--resume", tmp_path), "nothing else")
@@ -286,9 +285,10 @@ def test_a_run_without_a_report_tells_its_model_and_both_clocks(turbogs, capture
         ("trian x --out y", "no such command 'trian': did you mean 'train'? (known: ablate, bench, "),
         ("train s --out r --fctor 3", "turbogs train: there is no --fctor: did you mean '--factor'?"),
         ("train s --out r --iterations 5", "turbogs train: there is no --iterations: write train.iterations=5; see"),
-        ("train s --out r --train.iterations=5", "there is no --train.iterations: write train.iterations=5; see"),
+        ("train s --out r --train.seed=5", "turbogs train: there is no --train.seed: write train.seed=5; see"),
         ("train s --out r --pixel-sampler dense", "there is no --pixel-sampler: write pixel_sampler.type=dense; see"),
         ("plan iterations=5", "'iterations=5' is not of the form section.key=value: write train.iterations=5"),
+        ("plan x train.seed 5", "'train.seed' is not of the form section.key=value: write train.seed=VALUE"),
         ("plan pixel_sampler.tpe=dense", "unknown key 'pixel_sampler.tpe': did you mean 'type'?"),
         ("evaluate run", "no such command 'evaluate': did you mean 'eval'?"),
         ("train s --out r --factor abc", "--factor takes only whole numbers; see turbogs train --help"),

@@ -21,7 +21,7 @@ def view(
     device: Device = "auto",
     given: Given = NO_SCENE,
 ) -> int:
-    """Look at the newest model of a run, or a model trained anywhere, in a browser, until Ctrl-C.
+    """Look at a model in a browser, until Ctrl-C: the newest one of a run, or one trained anywhere.
 
     Args:
         run: folder of the run; or the file of a model, with --scene to see its photos, too.
@@ -37,7 +37,8 @@ def view(
 
 
 def evaluate(run: RunOrModel, overrides: Overrides = (), /, *, device: Device = "auto", given: Given = NO_SCENE) -> int:
-    """Measure the newest model of a run, or a model trained anywhere, on the test views.
+    """Measure a model on the test views: the newest one of a run, whose metrics.json is written, or one trained
+    anywhere.
 
     Args:
         run: folder of the run; or with --scene the file of a model.
@@ -63,7 +64,7 @@ def render(
     device: Device = "auto",
     given: Given = NO_SCENE,
 ) -> int:
-    """Render the newest model of a run, or a model trained anywhere, from the capture's cameras, as PNGs; or a film.
+    """Render a model from the capture's cameras, or a film: the newest one of a run, or one trained anywhere.
 
     Args:
         run: folder of the run; or with --scene the file of a model.
@@ -103,7 +104,7 @@ def export(
     cameras: FlagCreatePairsOff[bool] = False,
     given: Given = NO_SCENE,
 ) -> int:
-    """Write the newest model of a run, or a model trained anywhere, for other programs, in the capture's own
+    """Write a model for other programs: the newest one of a run, or one trained anywhere, in the capture's own
     coordinates; read it again, and say what was lost. Or write a capture with refined cameras for other trainers.
 
     Args:

@@ -89,7 +89,8 @@ def _unknown_option(function: Command, words: Sequence[str]) -> str:
         if "overrides" in signature(function).parameters:
             from turbogs_plugin.config.configuration import settings_named
 
-            settings = [f"{setting}={value if equals else behind}" for setting in settings_named(name)]
+            said = value if equals else "" if behind.startswith("--") else behind
+            settings = [f"{setting}={said or 'VALUE'}" for setting in settings_named(name)]
             remedy = f"write {' or '.join(settings)}" if settings else remedy
         return f"there is no {option}: {remedy}"
     return ""

@@ -179,8 +179,8 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         path, separator, text = override.partition("=")
         keys = path.strip().split(".")
         if not separator or len(keys) < 2 or not all(keys):
-            meant = [f"{name}={text}" for name in settings_named(keys[0])]
-            hint = f": write {' or '.join(meant)}" if separator and meant else ""
+            meant = " or ".join(f"{name}={text or 'VALUE'}" for name in settings_named(path.strip()))
+            hint = f": write {meant}" if meant else ""
             raise InputError(f"override '{override}' is not of the form section.key=value{hint}")
         if not text.strip():
             raise InputError(f"override '{override}' lacks a value: write one behind the =, or null for none")
