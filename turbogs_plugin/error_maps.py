@@ -53,8 +53,6 @@ class ErrorMaps:
     beta: float = 0.4
     refresh: int = 16
     masks: PixelMasks | None = None
-    errors: Tensor = field(init=False)  # [X] float16
-    stamps: Tensor = field(init=False)  # [X] int16, iteration of the last visit minus `stamp_base`
     view_sums: Tensor = field(init=False)  # [V] float64, sum of `errors` in each view
     stamp_base: int = field(init=False, default=0)
 
@@ -76,9 +74,18 @@ class ErrorMaps:
         self.offsets = np.concatenate([[0], np.cumsum(self.sizes.prod(axis=1))])  # [V + 1]
         pixels = int(self.offsets[-1])
         # One pixel more than the maps: empty slots write there, so they need not be filtered out first.
-        self._errors = torch.zeros(pixels + 1, dtype=torch.float16, device=self.device)
-        self._stamps = torch.full((pixels + 1,), -1, dtype=torch.int16, device=self.device)
-        self.errors, self.stamps = self._errors[:-1], self._stamps[:-1]
+        errors = torch.zeros(pixels + 1, dtype=torch.float16, device=self.device)
+        self._arrays: tuple[Tensor, ...] = errors, torch.full_like(errors, -1, dtype=torch.int16)
+
+    @property
+    def errors(self) -> Tensor:
+        """[X] float16."""
+        return self._arrays[0][:-1]
+
+    @property
+    def stamps(self) -> Tensor:
+        """[X] int16, iteration of the last visit minus `stamp_base`."""
+        return self._arrays[1][:-1]
 
     @classmethod
     def from_images(
@@ -142,15 +149,15 @@ class ErrorMaps:
             )
         self.fetch(samples.view_ids)
         stamp = self.stamp(step)
+        maps, stamps = self._arrays
         tiles, views = samples.tile_of_slot(), samples.view_of_tile()
         errors = pixel_errors.detach().float()
         starts = torch.as_tensor(self.offsets[list(samples.view_ids)], device=errors.device)
         changed = samples.filled & torch.isfinite(errors)
-        flat = torch.where(changed, starts[views][tiles] + samples.pixel_ids, len(self.errors))
-        old = self._errors[flat]
+        flat = torch.where(changed, starts[views][tiles] + samples.pixel_ids, len(maps) - 1)
+        old = maps[flat]
         new = (old.float() * (1.0 - self.beta) + errors * self.beta).clamp(max=ERROR_MAX).to(torch.float16)
-        self._errors[flat] = new
-        self._stamps[flat] = stamp
+        maps[flat], stamps[flat] = new, stamp
         deltas = torch.where(changed, new.double() - old.double(), 0.0)
         # Tile by tile first: on a GPU, additions to one number wait for each other.
         tile_sums = deltas.new_zeros(len(views)).index_add_(0, tiles, deltas)
@@ -219,7 +226,7 @@ class ErrorMaps:
 
     def _change_stamps(self, function: Callable[[Tensor], Tensor]) -> None:
         """Apply a function to the stamps of all views."""
-        self._stamps.copy_(function(self._stamps))
+        self._arrays[1].copy_(function(self._arrays[1]))
 
 
 class LaggedCopy:

@@ -6,7 +6,6 @@ import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -36,8 +35,8 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
     metrics = evaluate(model.gaussians, views, look, lpips, refined=True)
     mean, notes = metrics.mean, [f"LPIPS was not computed: {reason}"] if reason else []
     if model.folder is not None:
-        end: dict[str, Any] = {"iteration": model.iteration, "num_gaussians": len(model.gaussians), "fps": metrics.fps}
-        end |= {"mean": without_nan(mean), "views": [without_nan(view) for view in metrics.views]}
+        counts = {"iteration": model.iteration, "num_gaussians": len(model.gaussians), "fps": metrics.fps}
+        end = {**counts, "mean": without_nan(mean), "views": [without_nan(view) for view in metrics.views]}
         try:
             write_text_atomically(model.folder.metrics, json.dumps(end, indent=1) + "\n")
         except OSError as error:  # somebody else's run

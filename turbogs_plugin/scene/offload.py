@@ -219,20 +219,8 @@ class OffloadedErrorMaps(_Windowed, ErrorMaps):  # type: ignore[override]  # `of
     """Error maps in host memory, with a window on a device; `errors`, `stamps` and `offsets` are the window's."""
 
     @property
-    def errors(self) -> Tensor:  # type: ignore[override]  # read-only: the window's
-        return self._errors[:-1]
-
-    @property
-    def stamps(self) -> Tensor:  # type: ignore[override]  # read-only: the window's
-        return self._stamps[:-1]
-
-    @property
-    def _errors(self) -> Tensor:  # type: ignore[override]
-        return self._window.arrays[0]
-
-    @property
-    def _stamps(self) -> Tensor:  # type: ignore[override]
-        return self._window.arrays[1]
+    def _arrays(self) -> tuple[Tensor, ...]:  # type: ignore[override]  # read-only: the window's
+        return self._window.arrays
 
     def _allocate(self) -> None:
         pixels = int(self.sizes.prod(axis=1).sum())
