@@ -101,12 +101,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 def parse_yaml(text: str, where: str) -> dict[str, Any]:
     """The mapping in a YAML text, numbers as YAML 1.2 reads them (``1e-4`` is a float). `where` is what the text is,
-    for messages: ``config 'my.yaml'``.
-
-    Raises:
-        InputError: not YAML, not one mapping, nested too deeply; or with tags, anchors or aliases, which can run code
-            or grow without bound and are refused before anything is built.
-    """
+    for messages: ``config 'my.yaml'``. Raises `InputError`: not YAML, not one mapping, nested too deeply; or with tags,
+    anchors or aliases, which can run code or grow without bound and are refused before anything is built."""
     return deepcopy(_parsed(text, where))
 
 

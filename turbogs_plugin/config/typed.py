@@ -32,12 +32,8 @@ def settings_of(cls: type) -> dict[str, Field[Any]]:
 def build_dataclass(cls: type[T], mapping: Any, where: str, apart: Collection[str] = ()) -> T:
     """An instance of dataclass `cls` from a mapping of its settings as plain YAML values, nested dataclasses as nested
     mappings; those not named keep their defaults. `where` is the dotted place, for messages. Keys that stand `apart`
-    are the caller's.
-
-    Raises:
-        InputError: an unknown key (naming the nearest), a missing one, a wrong type, or a value that the dataclass
-            itself refuses.
-    """
+    are the caller's. Raises `InputError`: an unknown key (naming the nearest), a missing one, a wrong type, or a value
+    that the dataclass itself refuses."""
     if not isinstance(mapping, Mapping):
         raise InputError(f"{where}: expected a mapping of keys, got {mapping!r}")
     try:

@@ -90,11 +90,8 @@ def joined(device: str) -> Iterator[Ranks]:
     (`device`: auto, cpu or cuda) it sees only its own.
 
     An error of one process ends all, and one of them says why: the process that it happened to, or the first one that
-    misses another.
-
-    Raises:
-        InputError: there are fewer GPUs than processes on this machine, or the processes do not find each other.
-    """
+    misses another. Raises `InputError`: there are fewer GPUs than processes on this machine, or the processes do not
+    find each other."""
     if "TORCHELASTIC_RUN_ID" in os.environ:  # without a launcher, as under Slurm, a shell may go before its time
         end_with_parent()
     if not launched():

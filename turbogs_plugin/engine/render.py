@@ -18,11 +18,8 @@ from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 
 def rasterize(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:
-    """`Engine.render` by the engine of the Gaussians' device; `options` are the fields of `RenderOptions`.
-
-    Raises:
-        InputError: cameras of other views than the samples', or Gaussians that a gradient is wanted of.
-    """
+    """`Engine.render` by the engine of the Gaussians' device; `options` are the fields of `RenderOptions`. Raises
+    `InputError`: cameras of other views than the samples', or Gaussians that a gradient is wanted of."""
     rows, views = cameras.by_row()[2], samples.view_ids
     if len(rows) != len(views) or (isinstance(rows, tuple) and sorted(rows) == sorted(views) and rows != views):
         raise InputError(f"cameras are of views {list(rows)}, samples of {list(views)}: give cameras.select(view_ids)")

@@ -188,11 +188,8 @@ class RenderOptions:
     dropout: Dropout = NO_DROPOUT
 
     def used_degree(self, gaussians: Gaussians) -> int:
-        """The degree of spherical harmonics to evaluate.
-
-        Raises:
-            InputError: the model holds a higher degree than any engine evaluates, or a lower one than asked for.
-        """
+        """The degree of spherical harmonics to evaluate. Raises `InputError`: the model holds a higher degree than any
+        engine evaluates, or a lower one than asked for."""
         held = gaussians.sh_degree
         if held > MAX_SH_DEGREE:
             raise InputError(

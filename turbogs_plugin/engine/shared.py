@@ -53,11 +53,8 @@ class ModelCopies:
 
     @cached_property
     def distances(self) -> tuple[int, ...]:
-        """Bytes from the model to each copy: from every parameter to that parameter of the copy.
-
-        Raises:
-            InputError: a copy lies otherwise.
-        """
+        """Bytes from the model to each copy: from every parameter to that parameter of the copy. Raises `InputError`: a
+        copy lies otherwise."""
         filled = [(name, value) for name, value in self.gaussians.items() if value.numel()]
         found = [{getattr(copy, name).data_ptr() - value.data_ptr() for name, value in filled} for copy in self.copies]
         if any(len(each) != 1 for each in found):

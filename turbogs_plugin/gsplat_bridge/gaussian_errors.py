@@ -32,11 +32,8 @@ RENDERED = "pass what the rasterization returned"
 
 
 def residuals(info: dict[str, Any]) -> Tensor | None:
-    """[...] L1 norm over RGB of the residual at each pixel, or None where `info` has neither of its two parts.
-
-    Raises:
-        InputError: only one of them is there, or their shapes differ.
-    """
+    """[...] L1 norm over RGB of the residual at each pixel, or None where `info` has neither of its two parts. Raises
+    `InputError`: only one of them is there, or their shapes differ."""
     present = [key for key in (PREDICTION, GROUND_TRUTH) if key in info]
     if not present:
         return None

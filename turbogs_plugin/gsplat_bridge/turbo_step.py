@@ -181,10 +181,7 @@ class TurboStep:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from a state. `splats` gets its values; parameters that are the host's alone must be loaded before.
-
-        Raises:
-            InputError: it is of another training, or not of this form.
-        """
+        Raises `InputError`: it is of another training, or not of this form."""
         try:
             require_like(dict(state), self._state(), "state")
             require(state["max_steps"] == self.max_steps, "state.max_steps", state["max_steps"], f"{self.max_steps}")

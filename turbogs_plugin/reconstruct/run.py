@@ -79,11 +79,8 @@ def reconstruct(photos: Path, out: Path) -> Solution:
     new or of an earlier call: ``images``, ``sparse/0`` and, where the photos have them, ``masks``.
 
     A call for photos of an earlier call that was stopped repeats no finished step; a finished reconstruction is told
-    again. Masks are put in place at each call; a mask that is gone stays in the capture.
-
-    Raises:
-        InputError: photos or folder are not usable, or the photos cannot be solved. Then a new folder `out` is gone.
-    """
+    again. Masks are put in place at each call; a mask that is gone stays in the capture. Raises `InputError`: photos or
+    folder are not usable, or the photos cannot be solved. Then a new folder `out` is gone."""
     load_pycolmap()  # an absent package is told before photos are read
     found = read_photos(photos)
     place, _ = find_photos(photos)

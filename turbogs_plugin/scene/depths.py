@@ -41,11 +41,7 @@ class InverseDepths:
         cls, cameras: Cameras, shown: Observations | None, points: Tensor, maps: Maps | None = None
     ) -> InverseDepths:
         """Depths of the points [M, 3] where `shown` has them in photos of these cameras, of several in a cell the
-        nearest; elsewhere what `maps` give.
-
-        Raises:
-            InputError: no depth is known.
-        """
+        nearest; elsewhere what `maps` give. Raises `InputError`: no depth is known."""
         shapes = -(-cameras.sizes // CELL)  # [V, 2]
         starts = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))])
         cells = np.zeros(starts[-1], dtype=np.float32)

@@ -87,11 +87,8 @@ class CellKey:
 
 
 def load_ablation(name_or_file: str) -> Ablation:
-    """Ablation from a packaged name or a YAML file.
-
-    Raises:
-        InputError: an unknown name, an unreadable file, or one that is not an ablation.
-    """
+    """Ablation from a packaged name or a YAML file. Raises `InputError`: an unknown name, an unreadable file, or one
+    that is not an ablation."""
     mapping = read_named_yaml(name_or_file, PACKAGE, "ablation")
     ablation = build_dataclass(Ablation, mapping, f"ablation '{name_or_file}'")
     return replace(ablation, base=named_beside(ablation.base, name_or_file))

@@ -169,11 +169,8 @@ class StudyFolder:
         write_text_atomically(self.file, _text(study))
 
     def read_study(self) -> Study:
-        """Everything that the folder has, of ``results.json`` and of the cells' own files.
-
-        Raises:
-            InputError: no study, or a file that is wrong, which is named.
-        """
+        """Everything that the folder has, of ``results.json`` and of the cells' own files. Raises `InputError`: no
+        study, or a file that is wrong, which is named."""
         if not self.file.is_file():
             raise InputError(f"'{self.path}' holds no study: there is no {self.file.name}")
         study = _parsed(self.file)

@@ -24,11 +24,8 @@ UNSHARED = ("scene.", "report.", "train.seed", "train.checkpoint_every", "train.
 def study_of_runs(paths: Sequence[Path]) -> Study:
     """The runs as cells of a study. A variant has the name of its first run; the first run's variant is the baseline.
 
-    Runs are of one variant where they were asked for equal settings, whatever plan and budgets made of these.
-
-    Raises:
-        InputError: no run there, one that is not finished, or two with equal settings and one seed.
-    """
+    Runs are of one variant where they were asked for equal settings, whatever plan and budgets made of these. Raises
+    `InputError`: no run there, one that is not finished, or two with equal settings and one seed."""
     variants: dict[str, dict[str, Any]] = {}  # name -> what its runs were asked for, without what is unshared
     scenes: dict[str, tuple[object, ...]] = {}  # name -> path, factor and test views
     results: list[CellResult] = []

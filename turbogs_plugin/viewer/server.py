@@ -37,11 +37,8 @@ INSTALL = 'pip install "viser>=1.1,<2"'
 @contextlib.contextmanager
 def quiet_server(host: str, port: int) -> Iterator[viser.ViserServer]:
     """While entered, a viser server that says nothing on standard output, which is the command's, and answers to its
-    own names alone (`_guarded`). Port 0 takes any free one.
-
-    Raises:
-        InputError: viser is not installed, or no server can listen there (viser itself would take another port).
-    """
+    own names alone (`_guarded`). Port 0 takes any free one. Raises `InputError`: viser is not installed, or no server
+    can listen there (viser itself would take another port)."""
     try:
         import viser
     except ImportError as error:
@@ -200,11 +197,8 @@ class _OneLine(logging.Handler):
 @contextlib.contextmanager
 def _guarded(host: str) -> Iterator[None]:
     """While entered, a viser server begins that refuses its page and its socket to a foreign name (`_own_name`) and to
-    scripts of foreign pages that a browser on this machine has open, and that does not fill stderr.
-
-    Raises:
-        InputError: this viser serves otherwise.
-    """
+    scripts of foreign pages that a browser on this machine has open, and that does not fill stderr. Raises
+    `InputError`: this viser serves otherwise."""
     from websockets.asyncio import server as sockets
 
     logger, serve, guarded = logging.getLogger("websockets.server"), sockets.serve, []

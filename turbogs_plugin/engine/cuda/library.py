@@ -71,11 +71,8 @@ recorder of launches puts its own functions here."""
 
 
 def launch(arguments: launches.Launch) -> None:
-    """Call the operator of a launch. It is enqueued on torch's current stream of its tensors' device.
-
-    Raises:
-        RuntimeError: the operator does not accept a tensor; the message names it.
-    """
+    """Call the operator of a launch. It is enqueued on torch's current stream of its tensors' device. Raises
+    `RuntimeError`: the operator does not accept a tensor; the message names it."""
     getattr(operators, arguments.operator)(*arguments.lists())
 
 
