@@ -115,10 +115,9 @@ def test_a_resumed_run_has_the_same_cameras(turbogs, capture, tmp_path):
     """To the bit, though the refinement is done again."""
     settings = ("scene.factor=8", "train.sh_degree=0", "schedule.max_views=3", "train.backdrop=false")
     settings += ("train.iterations=6", "train.refine_until=3", "train.checkpoint_every=3", "--no-report")
-    code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *settings)
+    code, _, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *settings)
     assert code == 0, err
-    assert "7 of 7 training cameras refined" in err
-    assert [line.split()[:2] for line in out.splitlines()].count(["refined", "cameras"]) == 1
+    assert "7 of 7 training cameras refined" in err and err.count("by refined cameras") == 1
     shutil.copytree(tmp_path / "run", tmp_path / "again")
     (tmp_path / "again" / "checkpoints" / "iteration-000006.pt").unlink()
     code, _, err = turbogs("train", "--resume", tmp_path / "again", "--no-report")
@@ -126,4 +125,4 @@ def test_a_resumed_run_has_the_same_cameras(turbogs, capture, tmp_path):
     first, second = ((tmp_path / name / "model.ply").read_bytes() for name in ("run", "again"))
     assert first == second
     code, out, err = turbogs("eval", tmp_path / "run", "--device", "cpu")
-    assert code == 0 and "PSNR in dB by refined test cameras" in out
+    assert code == 0 and "\nmean by refined test cameras " in out

@@ -57,7 +57,6 @@ def report(
     /,
     *,
     out: Path | None = None,
-    psnr: Annotated[tuple[float, ...], arg(metavar="DB ...")] = (),
 ) -> int:
     """Write the reports of studies again, from their results.json; or a report of runs side by side, where runs that
     were asked the same, but for the seed, count as one variant.
@@ -65,13 +64,11 @@ def report(
     Args:
         paths: folders of studies; or of two runs or more, the first of which the others are compared with.
         out: new folder for the report of runs.
-        psnr: test PSNRs whose time is asked for; from the baseline's result where absent.
     """
     from turbogs_plugin.study.results import StudyFolder
     from turbogs_plugin.study.runs import study_of_runs
     from turbogs_plugin.study.study_report import write_report
 
-    require_positive("--psnr", *psnr)
     if not paths:
         raise InputError("report needs STUDY ..., folders of studies, or RUN RUN ... --out NEW, folders of runs")
     if out is not None:
@@ -83,5 +80,5 @@ def report(
     for folder in map(StudyFolder, paths if out is None else (out,)):
         if not folder.read_study().results:
             raise InputError(f"'{folder.path}' has no finished cells to report on: go on with turbogs ablate")
-        print(f"report  {write_report(folder, psnr)}")
+        print(f"report  {write_report(folder)}")
     return 0

@@ -40,11 +40,11 @@ HOW_TO_READ = (
 )
 
 
-def write_report(folder: StudyFolder, targets: Sequence[float] = ()) -> Path:
+def write_report(folder: StudyFolder) -> Path:
     """Write ``results.json`` of everything in the folder, and from it the plot and the page; the page."""
     folder.write_study(folder.read_study())
     study = folder.read_study()  # with the digits that the file keeps
-    summaries = summarise(study, targets)
+    summaries = summarise(study)
     write_plot(folder.path, summaries)
     page = folder.path / "report.md"
     write_text_atomically(page, report_text(study, summaries))
