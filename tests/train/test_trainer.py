@@ -27,6 +27,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import require_writable
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
+from turbogs_plugin.strategies.losses import CharbonnierLoss
 from turbogs_plugin.strategies.protocols import PixelSampler, SparseLoss
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
@@ -369,3 +370,5 @@ def test_fit_takes_a_mapping_and_a_callback_and_names_what_it_does_not_know(capt
         fit(capture, sampler=None)
     with pytest.raises(InputError, match="fit: object is no PixelSampler: it lacks sample"):
         fit(capture, config=settings, pixel_sampler=object())
+    with pytest.raises(InputError, match="loss: depths are read for the setting loss.depth_weight alone"):
+        fit(capture, config=settings, loss=CharbonnierLoss(depth_weight=0.1))

@@ -69,8 +69,12 @@ class Trainer(TrainingState):
 
         # 8) Backward to the screen, summing for each Gaussian what step 11 needs (errors, weights, squares)
         stats = self.density.stats
-        of_colors, of_depths, told = loss.color_gradients, loss.depth_gradients, stats is not None
-        screen = rendered.backward(of_colors, loss.pixel_errors, with_statistics=told, depth_gradients=of_depths)
+        screen = rendered.backward(
+            loss.color_gradients,
+            loss.pixel_errors,
+            with_statistics=stats is not None,
+            depth_gradients=loss.depth_gradients,
+        )
 
         # 9) and 10) Backward to the parameters, solve for their updates and apply them; adds to `stats`
         self.update(screen, stats, step)

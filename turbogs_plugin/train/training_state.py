@@ -101,6 +101,8 @@ class TrainingState:
 
     def take(self, kind: str, strategy: Any) -> None:
         """Put a strategy in the place of the present one of its kind, before the first iteration."""
+        if kind == "loss" and strategy.terms is not None and strategy.terms.depth_weight and self.depths is None:
+            raise InputError("loss: depths are read for the setting loss.depth_weight alone: set that")
         setattr(self, kind, strategy)
         if kind == "view_sampler":
             strategy.setup(self.views.cameras, self.extent)
