@@ -370,5 +370,5 @@ def test_fit_takes_a_mapping_and_a_callback_and_names_what_it_does_not_know(capt
         fit(capture, sampler=None)
     with pytest.raises(InputError, match="fit: object is no PixelSampler: it lacks sample"):
         fit(capture, config=settings, pixel_sampler=object())
-    with pytest.raises(InputError, match="loss: depths are read for the setting loss.depth_weight alone"):
+    with pytest.raises(InputError, match=r"loss: depths are read for the setting loss\.depth_weight alone"):
         fit(capture, config=settings, loss=CharbonnierLoss(depth_weight=0.1))
