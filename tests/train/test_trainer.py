@@ -27,6 +27,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import require_writable
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
+from turbogs_plugin.strategies.density.rows import NoDensity
 from turbogs_plugin.strategies.losses import CharbonnierLoss
 from turbogs_plugin.strategies.protocols import PixelSampler, SparseLoss
 from turbogs_plugin.train import run
@@ -36,7 +37,7 @@ from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.run import fit
 from turbogs_plugin.train.session import interruptible
-from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.train.trainer import Trainer, require_rows
 from turbogs_plugin.types import LossOutput, PixelSamples, RowUpdate
 from turbogs_plugin.yaml_json import parse_yaml
 
@@ -340,6 +341,24 @@ def test_what_a_strategy_of_ones_own_returns_is_refused_and_nothing_is_left(
     with pytest.raises(InputError, match=message):
         run.train(tiny_config(capture, "schedule.min_views=3", "view_sampler.type=random"), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+ROWS, SAME = torch.arange(3), torch.zeros(3, dtype=torch.bool)
+
+
+@pytest.mark.parametrize(
+    ("update", "message"),
+    [
+        (RowUpdate(ROWS, SAME, {"scale": torch.zeros(3, 3)}), "with values of scale"),
+        (RowUpdate(ROWS, SAME, {"scales": torch.zeros(4, 3)}), "of 3 rows with 4 values of scales"),
+        (RowUpdate(ROWS, SAME[:2], {}), "with fresh of 2 rows"),
+        (RowUpdate(~SAME, SAME, {}), r"with source of torch\.bool: source has old rows, as of torch\.nonzero"),
+        (SAME, "NoDensity returned Tensor, not RowUpdate"),
+    ],
+)
+def test_a_change_of_rows_that_does_not_fit_together_is_refused(update, message):
+    with pytest.raises(InputError, match=message):
+        require_rows(update, NoDensity())
 
 
 def test_a_folder_that_cannot_be_written_is_not_resumed(capture, tmp_path, monkeypatch):

@@ -80,11 +80,8 @@ def raster_floors(counts: Counts, bandwidth: float) -> dict[str, float]:
 
 
 def step_floors(counts: Counts, bandwidth: float) -> dict[str, float]:
-    """Milliseconds that each step of an iteration cannot beat.
-
-    Args:
-        counts: of `raster_counts`, with `pixels` (of the K views) and `touched` (Gaussians updated).
-    """
+    """Milliseconds that each step of an iteration cannot beat. `counts`: of `raster_counts`, with `pixels` (of the K
+    views) and `touched` (Gaussians updated)."""
     raster = raster_floors(counts, bandwidth)
     samples, touched = counts["samples"], counts["touched"]
     traffic = {

@@ -120,10 +120,7 @@ def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
 
 def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
     """[C, N, D], or [nnz, D] where packed: the sum over pixels of ``upstream * w``, by gsplat's rasterizer.
-
-    Args:
-        info: of a pass of gsplat's `rasterization`. upstream: [C, H, W, D].
-    """
+    `info`: of a pass of gsplat's `rasterization`; `upstream`: [C, H, W, D]."""
     from gsplat import rasterize_to_pixels
 
     tiles = ("width", "height", "tile_size", "isect_offsets", "flatten_ids")

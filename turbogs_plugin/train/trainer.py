@@ -17,8 +17,9 @@ from turbogs_plugin.model.limits import RESTRAIN_EVERY, restrain_distant
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene.depths import DepthPair
 from turbogs_plugin.scene.photos import PhotoSamples
+from turbogs_plugin.strategies.protocols import DensityController, PixelSampler, SparseLoss
 from turbogs_plugin.train.training_state import TrainingState
-from turbogs_plugin.types import GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
+from turbogs_plugin.types import PARAMETER_NAMES, GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
 DROPOUT_UNTIL = 0.95
 """Share of a run after which no Gaussian is left out any more, so that the model is fitted as it is drawn."""
@@ -45,7 +46,7 @@ class Trainer(TrainingState):
 
         # 3) Pixel sampling
         samples = self.pixel_sampler.sample(self.maps, view_ids, budget.rate, step)
-        require_samples(samples, view_ids, self.config.pixel_sampler["type"])
+        require_samples(samples, view_ids, self.pixel_sampler)
         if self.maps.masks is not None and not self.pixel_sampler.heeds_masks:
             samples = self.maps.masks.strip(samples)
         if self.on_samples is not None:
@@ -96,7 +97,7 @@ class Trainer(TrainingState):
             loss = self.engine.supervise(terms, shown, truth, update)
         else:
             loss = self.loss(shown, truth.colors(), samples)
-            require_output(loss, shown, self.config.loss["type"])
+            require_output(loss, shown, self.loss)
             self.engine.learn(samples, shown, loss, update)
         if self.exposures is None:
             return loss
@@ -132,6 +133,7 @@ class Trainer(TrainingState):
         until `refine_until`. Not in the paper: what stands right before a camera goes with any change; and the size of
         distant Gaussians is limited, every `RESTRAIN_EVERY` iterations, also without a change."""
         if update is not None:
+            require_rows(update, self.density)
             if self.clearance is not None:
                 update = self.clearance.clear(update, self.gaussians)
             if len(update.source) == 0:
@@ -142,18 +144,39 @@ class Trainer(TrainingState):
             restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)
 
 
-def require_samples(samples: PixelSamples, view_ids: Sequence[int], name: str) -> None:
-    """Raise `InputError` unless `samples` of the pixel sampler `name` are of these views, in this order, whose renders
-    are compared with their photos and error maps."""
+def require_type(value: object, kind: type, strategy: object) -> None:
+    """Raise `InputError` unless what a strategy returned is of this type."""
+    if not isinstance(value, kind):
+        raise InputError(f"{type(strategy).__name__} returned {type(value).__name__}, not {kind.__name__}")
+
+
+def require_samples(samples: PixelSamples, view_ids: Sequence[int], sampler: PixelSampler) -> None:
+    """Raise `InputError` unless `samples` are of these views, in this order, whose renders are compared with their
+    photos and error maps."""
+    require_type(samples, PixelSamples, sampler)
     if samples.view_ids != tuple(view_ids):
-        said = f"pixel_sampler.type '{name}' returned samples of views {samples.view_ids}, asked for {tuple(view_ids)}"
+        said = f"{type(sampler).__name__} returned samples of views {samples.view_ids}, asked for {tuple(view_ids)}"
         raise InputError(f"{said}: give view_ids to PixelSamples, or to from_mask")
 
 
-def require_output(output: LossOutput, colors: Tensor, name: str) -> None:
-    """Raise `InputError` unless the shapes of a `LossOutput` of the loss `name` fit colours [P, 3]."""
+def require_rows(update: RowUpdate, controller: DensityController) -> None:
+    """Raise `InputError` unless the parts of a change of rows fit together."""
+    require_type(update, RowUpdate, controller)
+    count, kind = len(update.source), update.source.dtype
+    wrong = [f"values of {name}" for name in update.values if name not in PARAMETER_NAMES]
+    wrong += [f"{len(value)} values of {name}" for name, value in update.values.items() if len(value) != count]
+    wrong += [f"fresh of {len(update.fresh)} rows"] if len(update.fresh) != count else []
+    wrong += [f"source of {kind}"] if kind != torch.int64 else []
+    if wrong:
+        said = f"{type(controller).__name__} returned a RowUpdate of {count} rows with {wrong[-1]}"
+        raise InputError(f"{said}: source has old rows, as of torch.nonzero; fresh and parameters' values as many")
+
+
+def require_output(output: LossOutput, colors: Tensor, loss: SparseLoss) -> None:
+    """Raise `InputError` unless the shapes of a `LossOutput` fit colours [P, 3]."""
+    require_type(output, LossOutput, loss)
     shapes = {"loss": (), "color_gradients": tuple(colors.shape), "pixel_errors": (len(colors),)}
     for field, shape in shapes.items():
         found = tuple(getattr(output, field).shape)
         if found != shape:
-            raise InputError(f"loss.type '{name}' returned {field} of shape {found}, not {shape}")
+            raise InputError(f"{type(loss).__name__} returned {field} of shape {found}, not {shape}")
