@@ -56,6 +56,13 @@ def test_every_built_in_strategy_is_exported():
     assert built_in | {*strategies.PROTOCOLS.values()} <= set(strategies.__all__)
 
 
+def test_what_type_checkers_see_of_a_package_is_what_it_has():
+    for package in (turbogs_plugin, strategies):
+        block = Path(package.__file__).read_text(encoding="utf-8").split("if TYPE_CHECKING", 1)[1].split("\n\n", 1)[0]
+        names = {name for name in re.findall(r"\b[A-Za-z_]\w*\b", re.sub(r"(?m)^.*?\bimport\b|#.*|\w+ as ", "", block))}
+        assert {name for name in names if name != "from"} == set(package.__all__) & set(dir(package)) - {"__version__"}
+
+
 def test_readmes_three_lines(tmp_path):
     """README's lines run as printed, on a smaller capture and for fewer iterations."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -18,19 +18,15 @@ if TYPE_CHECKING:
     from turbogs_plugin.engine.render import rasterize as rasterize
     from turbogs_plugin.engine.render import render_image as render_image
     from turbogs_plugin.export.camera_path import orbit as orbit
+    from turbogs_plugin.train.run import Fit as Fit
     from turbogs_plugin.train.run import fit as fit
-    from turbogs_plugin.train.saved_model import load_model as load_model
 
 __version__ = "0.1.0"
 
 
 def lazy_face(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """``__getattr__`` and ``__dir__`` of a package whose names are imported when they are first used.
-
-    Args:
-        package: its name.
-        places: name -> the module that has it.
-    """
+    """``__getattr__`` and ``__dir__`` of a package whose names are imported when they are first used. `places`: name ->
+    the module that has it."""
 
     def __getattr__(name: str) -> Any:
         if name not in places:
@@ -41,6 +37,7 @@ def lazy_face(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], 
 
 
 _PLACES = {
+    "Fit": "turbogs_plugin.train.run",
     "fit": "turbogs_plugin.train.run",
     "load_scene": "turbogs_plugin.captures",
     "rasterize": "turbogs_plugin.engine.render",
