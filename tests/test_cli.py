@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import TINY, stop_after
-from helpers.models import load_ply
 from PIL import Image
 
 from turbogs_plugin import __version__, captures, cli
@@ -21,6 +20,7 @@ from turbogs_plugin.config import configuration
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.renders import distinct_stems
+from turbogs_plugin.model.ply import load_ply
 from turbogs_plugin.train import inputs, run
 
 pytestmark = pytest.mark.usefixtures("plotted")

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.models import load_ply
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import load_pycolmap
@@ -18,7 +17,7 @@ from turbogs_plugin.export import renders
 from turbogs_plugin.export.camera_path import through_views
 from turbogs_plugin.export.model_export import EXPORTS, contributions, pruned
 from turbogs_plugin.model.formats import FORMATS
-from turbogs_plugin.model.ply import save_ply
+from turbogs_plugin.model.ply import load_ply, save_ply
 from turbogs_plugin.train.saved_model import load_given, load_model, read_given
 from turbogs_plugin.types import SH_C0, WHITE
 

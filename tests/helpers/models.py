@@ -1,12 +1,7 @@
 """Models that tests of several rooms share."""
 
-from pathlib import Path
-
 import torch
 
-from turbogs_plugin.model.ply import OWN, read_ply
-from turbogs_plugin.model.similarity import Similarity, placed
-from turbogs_plugin.scene import Frame
 from turbogs_plugin.types import Gaussians
 
 
@@ -17,8 +12,3 @@ def random_gaussians(count: int = 40, sh_degree: int = 3, seed: int = 0, dtype=t
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (bands, 3)}
     values = {name: torch.randn(count, *shape, generator=generator, dtype=dtype) for name, shape in shapes.items()}
     return Gaussians(**values)
-
-
-def load_ply(path: Path, frame: Frame = OWN) -> Gaussians:
-    """The model of `read_ply` as training and rendering take it, in a frame of the file's coordinates."""
-    return placed(read_ply(path)[0], Similarity.into(frame), path)

@@ -9,10 +9,11 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 import torch
-from helpers.models import OWN, random_gaussians
+from helpers.models import random_gaussians
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.model_export import EXPORTS
+from turbogs_plugin.model.ply import OWN
 from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.model.spz import read_spz, save_spz
 from turbogs_plugin.scene import Frame

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 from gsplat import export_splats
-from helpers.models import load_ply, random_gaussians
+from helpers.models import random_gaussians
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.model.ply import read_ply, save_ply
+from turbogs_plugin.model.ply import load_ply, read_ply, save_ply
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.scene.ply import read_vertices
 

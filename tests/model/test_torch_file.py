@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from helpers.models import OWN, random_gaussians
+from helpers.models import random_gaussians
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.model.ply import OWN
 from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.model.torch_file import read_gsplat, save_gsplat
 from turbogs_plugin.scene import Frame

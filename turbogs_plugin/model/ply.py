@@ -11,7 +11,7 @@ import torch
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
-from turbogs_plugin.model.similarity import in_capture, rounding
+from turbogs_plugin.model.similarity import Similarity, in_capture, placed, rounding
 from turbogs_plugin.model.torch_file import BANDS
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.ply import read_vertices
@@ -19,10 +19,8 @@ from turbogs_plugin.types import Gaussians
 
 POSITION_ERROR = 1e-6
 """Largest `rounding` of positions that are written as float."""
-OWN = Frame(np.zeros(3), 1.0)
-"""The frame that is the capture's own coordinates."""
-HEADER_AT_MOST = 1 << 16
-"""Bytes of a file in which a comment is looked for."""
+OWN = Frame(np.zeros(3), 1.0)  # the frame that is the capture's own coordinates
+HEADER_AT_MOST = 1 << 16  # bytes of a file in which a comment is looked for
 ANTIALIASED = re.compile(rb"^comment\s+(splatrendermode:\s*mip|antialiased\W+(1|true))\b", re.MULTILINE | re.IGNORECASE)
 """Brush's comment, which splat-transform writes, too, and Postshot's."""
 
@@ -91,6 +89,11 @@ def read_ply(path: Path) -> tuple[Gaussians, bool]:
         header = file.read(HEADER_AT_MOST).replace(b"\r", b"\n").partition(b"\nend_header")[0]
     model = Gaussians(means, quats, scales, opacities, sh0[:, None], shN.reshape(count, 3, rest // 3).mT)
     return model, ANTIALIASED.search(header) is not None
+
+
+def load_ply(path: Path, frame: Frame = OWN) -> Gaussians:
+    """The model of `read_ply` as training and rendering take it, in a frame of the file's coordinates."""
+    return placed(read_ply(path)[0], Similarity.into(frame), path)
 
 
 def _property_groups(bands: int) -> dict[str, list[str]]:
