@@ -272,7 +272,8 @@ __global__ void __launch_bounds__(kBackwardThreads, kStepBlocks) fused_step_kern
                                                    1.0f / bias_correction(optimizer.log_beta2, steps));
             optimizer.steps[gaussian] = steps;
             block_corrections[threadIdx.x] = corrections;
-            update_row<kSolve, kCopied>(params, optimizer, gaussian, rows, load_gaussian(params, gaussian), corrections);
+            update_row<kSolve, kCopied>(
+                params, optimizer, gaussian, rows, load_gaussian(params, gaussian), corrections);
             if (params.sh_degree > 0) rows.harmonics(stored.mean, block.cameras, params.sh_degree, gradients);
         } else if (rows.count > 0) {
             atomicAdd(optimizer.skipped, 1ull);
