@@ -5,6 +5,7 @@
 #
 # The captures are folders of these names. Results lie in OUT/COMMIT; what is there is not measured again, so the same
 # call goes on after a stop (Ctrl-C, or `timeout --signal INT 9m`). When all is there, it is copied into docs/lab.
+# SEEDS="0 1" has other seeds in the record than three, REPEATS=1 fewer timed commands; STUDIES="" the record alone.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 if [ -z "${TURBOGS_COMMIT:-}" ] && [ -n "$(git status --porcelain --untracked-files=no)" ]; then
@@ -25,23 +26,25 @@ ablate() { # NAME SEEDS CAPTURE ... [--only VARIANT ...]
 }
 
 wall() { # VARIANT CAPTURE REPEATS SETTING ...
-    local file=$out/wall-$1-$(basename "$2").json
-    [ -e "$file" ] || turbogs bench wall "${@:4}" --scene "$2" --repeats "$3" --out "$file"
+    local file=$out/wall-$1-$(basename "$2").json gpu=$((walls++ % gpus))
+    [ -e "$file" ] || CUDA_VISIBLE_DEVICES=$gpu turbogs bench wall "${@:4}" --scene "$2" --repeats "$3" --out "$file" &
+    [ $gpu -lt $((gpus - 1)) ] || wait
 }
+walls=0
 
 declare -A caps=([fox]=67 [caliterra]=157 [snowmiku]=57 [bonsai]=161 [train]=203) # thousands, FastGS's numbers
 for capture in "$@"; do
-    ablate record "0 1 2" "$capture" --only no-exposures ssim "cap-${caps[$(basename "$capture")]}k"
+    ablate record "${SEEDS:-0 1 2}" "$capture" --only no-exposures ssim "cap-${caps[$(basename "$capture")]}k"
 done
 structure=(density.absgrad_threshold=4.5e-4 pixel_sampler.unit=tile loss.type=sparse_ssim loss.ssim_weight=0.4)
 for capture in "$@"; do
-    wall turbogs "$capture" 3
+    wall turbogs "$capture" "${REPEATS:-3}"
     wall no-exposures "$capture" 1 train.exposure=false
     wall ssim "$capture" 1 "${structure[@]}" train.dropout=auto # configs/turbogs-ssim.yaml
     cap=${caps[$(basename "$capture")]}
     wall "cap-${cap}k" "$capture" 1 train.exposure=false "density.max_gaussians=${cap}000"
 done
-# STUDIES="" measures the record alone.
+wait
 for study in ${STUDIES-paper parts departures density_departures bounds cameras paper_parts}; do
     ablate "$study" "0 1 2 3 4" "${@:1:3}"
 done
