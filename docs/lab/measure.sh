@@ -54,13 +54,14 @@ for file in "$out"/*/results.json; do
     study=docs/lab/$(basename "$(dirname "$file")")
     mkdir -p "$study" && cp "$file" "$study/"
 done
-python - "$out" <<'PYTHON'
+python - "$out" "$@" <<'PYTHON'
 """Joins the walls: variant -> capture -> what `turbogs bench wall` wrote."""
 import json, pathlib, sys
 
 walls = {}
-for file in sorted(pathlib.Path(sys.argv[1]).glob("wall-*.json")):
-    variant, capture = file.stem.removeprefix("wall-").rsplit("-", 1)
-    walls.setdefault(variant, {})[capture] = json.loads(file.read_text())
-pathlib.Path("docs/lab/wall.json").write_text(json.dumps(walls, indent=1) + "\n")
+for capture in (pathlib.Path(place).name for place in sys.argv[2:]):
+    for file in sorted(pathlib.Path(sys.argv[1]).glob(f"wall-*-{capture}.json")):
+        variant = file.stem.removeprefix("wall-").removesuffix(f"-{capture}")
+        walls.setdefault(variant, {})[capture] = json.loads(file.read_text())
+pathlib.Path("docs/lab/wall.json").write_text(json.dumps(walls) + "\n")
 PYTHON

@@ -171,7 +171,7 @@ def test_a_whole_step_whose_loss_is_read_waits_for_nothing():
     cameras, photos = make_cameras(3), 255 * truth(make_cameras(3, "cuda")).cpu()
     poses = torch.linalg.inv(cameras.viewmats)
     views = [{"image": photos[i], "K": cameras.Ks[i], "camtoworld": poses[i]} for i in range(3)]
-    options = ("train.backdrop=false", "density.refine_from=150")
+    options = ("train.backdrop=false", "density.refine_from=4000")
     turbo = TurboStep(splats_on_gpu(), views, max_steps=200, overrides=options)
     seen = [float(turbo.step(step).loss) for step in range(40)]
     torch.cuda.synchronize()
