@@ -138,7 +138,7 @@ def loaded(tmp_path_factory) -> list[set[str]]:
     folder = tmp_path_factory.mktemp("rooms")
     config = tiny_config(tiny_capture(folder), "train.iterations=2", "train.evaluate_at=[]").to_yaml()
     (folder / "config.yaml").write_text(config)
-    parts = ("turbogs_plugin.train.clock, turbogs_plugin.cli", ", ".join(f"turbogs_plugin.{room}" for room in ROOMS))
+    parts = ("turbogs_plugin.train.wall, turbogs_plugin.cli", ", ".join(f"turbogs_plugin.{room}" for room in ROOMS))
     steps = ["import turbogs_plugin", *(f"import {part}" for part in parts), RUN]
     told = "\nimport json, sys\nprint(json.dumps(sorted(sys.modules)))\n"
     code = told.join(["\n".join(steps[:2]), *steps[2:], ""])
@@ -148,7 +148,7 @@ def loaded(tmp_path_factory) -> list[set[str]]:
 
 
 def test_the_package_the_clock_of_the_wall_and_the_command_line_load_no_torch(loaded):
-    assert {"turbogs_plugin.train.clock", "turbogs_plugin.cli"} <= loaded[0] and not loaded[0] & (
+    assert {"turbogs_plugin.train.wall", "turbogs_plugin.cli"} <= loaded[0] and not loaded[0] & (
         SLOW | {"torch", "numpy"}
     )
 

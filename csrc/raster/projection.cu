@@ -19,8 +19,7 @@ namespace {
 constexpr int kPrepareThreads = 256;      // no record of other values; the launch is small
 constexpr int kProjectionGaussians = 64;  // of a block; their harmonics of 180 bytes each lie in shared memory
 constexpr int kProjectionSlices = 4;      // most threads of a Gaussian: a small model alone does not fill the GPU
-// Threads that do fill it. Measured on an H200: from about 500,000 Gaussians on one thread each is best
-// (performance.md, 2).
+// Threads that do fill it. Measured on an H200: from about 500,000 Gaussians on one thread each is best.
 constexpr int kEnoughThreads = 500'000;
 constexpr int kProjectionBlocks = 4;   // of an SM: up to 64 registers, so that nothing spills
 constexpr float kExtentMax = 3.33f;    // gsplat's cut of a splat's half width, standard deviations

@@ -27,9 +27,9 @@ from turbogs_plugin.distributed.processes import joined
 from turbogs_plugin.distributed.ranks import ProcessRanks
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
-from turbogs_plugin.train.clock import WallRecord
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.train.wall import WallRecord
 
 EXCHANGES = ("agree", "gather_numbers", "broadcast", "exchange")
 MOMENTS = 60

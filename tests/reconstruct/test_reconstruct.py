@@ -15,7 +15,7 @@ from PIL import Image
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.load import holds_photos_alone
 from turbogs_plugin.reconstruct import Solution, reconstruct, run, solver
-from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups
+from turbogs_plugin.reconstruct.ghosts import Agreement, consistent_groups
 
 COUNT = 7
 

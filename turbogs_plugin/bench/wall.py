@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from turbogs_plugin.errors import InputError, TrainingStopped
-from turbogs_plugin.train.clock import WallRecord
 from turbogs_plugin.train.run_files import RunFolder
+from turbogs_plugin.train.wall import WallRecord
 
 REST = "start of the process, and its end"
 """What a process cannot measure of itself."""

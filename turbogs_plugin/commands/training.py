@@ -13,7 +13,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from turbogs_plugin.commands.options import LOCAL, NO_OPTIONS, PORT, Count, Flat, Overrides, Scene, require_positive
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.train.clock import WallClock
+from turbogs_plugin.train.wall import WallClock
 
 if TYPE_CHECKING:
     from turbogs_plugin.train.session import RunSession

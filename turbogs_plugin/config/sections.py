@@ -95,8 +95,8 @@ class TrainConfig:
             from photo to photo (`turbogs_plugin.engine.exposures`). Test photos are compared with the exposure of the
             training photos before and after them (`turbogs_plugin.train.look`). ``auto``: where
             photos differ, but little from those before and after them.
-        dropout: share of the Gaussians that each iteration leaves out, drawn anew each time, until
-            `trainer.DROPOUT_UNTIL` of the run. ``auto``: where points are a median of 0.4 pixels or more from
+        dropout: share of the Gaussians that each iteration leaves out (`engine.rules.Dropout`), drawn anew each time,
+            until `trainer.DROPOUT_UNTIL` of the run. ``auto``: where points are a median of 0.4 pixels or more from
             where photos show them.
         distant_size: largest standard deviation of a Gaussian beyond 2 scene extents, over its distance from the
             cameras (`restrain_distant`). 0: no bound.

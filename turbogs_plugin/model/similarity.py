@@ -1,4 +1,4 @@
-"""A change of coordinates of a whole model: means, shapes, and the colours that depend on the direction."""
+"""A change of a whole model's coordinates, colours and all; `placed`: a file's rows, flat or infinite ones mended."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from turbogs_plugin.captures.photo_files import find_photos, unread
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable, write_text_atomically
 from turbogs_plugin.reconstruct import solver
-from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups, ghost_pairs
+from turbogs_plugin.reconstruct.ghosts import Agreement, consistent_groups, ghost_pairs
 from turbogs_plugin.reconstruct.matching import FEW, choose_pairs
 from turbogs_plugin.reconstruct.photos import PhotoFile, place_masks, place_photos, read_photos
 from turbogs_plugin.yaml_json import parse_json

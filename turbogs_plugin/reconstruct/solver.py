@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from turbogs_plugin.captures.colmap import load_pycolmap
-from turbogs_plugin.reconstruct.agreement import Agreement
+from turbogs_plugin.reconstruct.ghosts import Agreement
 from turbogs_plugin.reconstruct.photos import PhotoFile
 
 if TYPE_CHECKING:

@@ -17,11 +17,11 @@ from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.study.results import CellResult, changes, curve_and_final, flat_settings, measured
-from turbogs_plugin.train.clock import WallClock
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.metrics import Evaluations, evaluate
 from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.train.wall import WallClock
 
 WARMUP_ITERATIONS = {"cuda": 20, "cpu": 2}
 """Length to which the configuration is scaled for the warm-up before the clock starts, which loads the code of every

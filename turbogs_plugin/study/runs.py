@@ -13,9 +13,9 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import unused_name
 from turbogs_plugin.study.grid import Ablation
 from turbogs_plugin.study.results import CellResult, Study, changes, curve_and_final, flat_settings, measured
-from turbogs_plugin.train.clock import WallRecord
 from turbogs_plugin.train.history import Evaluation, read_history
 from turbogs_plugin.train.run_files import RunFolder
+from turbogs_plugin.train.wall import WallRecord
 
 UNSHARED = ("scene.", "report.", "train.seed", "train.checkpoint_every", "train.evaluate_at")
 """Beginnings of settings in which runs of a variant may differ: seed, photos, and what is only reported or kept."""

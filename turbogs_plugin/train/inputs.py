@@ -19,7 +19,7 @@ from turbogs_plugin.engine import library
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.agreement import require_agreement, unseeing_note
-from turbogs_plugin.train.clock import WallClock
+from turbogs_plugin.train.wall import WallClock
 
 
 def resolve_device(name: str) -> torch.device:

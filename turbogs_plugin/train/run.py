@@ -27,7 +27,6 @@ from turbogs_plugin.plan.photo_gains import PhotoGains
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
-from turbogs_plugin.train.clock import WallClock
 from turbogs_plugin.train.history import Evaluation, rewind_history
 from turbogs_plugin.train.inputs import cpu_note, open_scene, open_started, require_device, resolve_device
 from turbogs_plugin.train.loop import TrainingLoop
@@ -37,6 +36,7 @@ from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.train.saved_model import require_model
 from turbogs_plugin.train.session import Report, RunSession, TrainingProgress, Watch
 from turbogs_plugin.train.trainer import Trainer
+from turbogs_plugin.train.wall import WallClock
 from turbogs_plugin.types import Gaussians
 
 IMPORTS = "interpreter and imports"

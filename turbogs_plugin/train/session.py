@@ -25,11 +25,11 @@ from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
-from turbogs_plugin.train.clock import WallClock, WallRecord
 from turbogs_plugin.train.history import Evaluation, append_evaluation, rewind_history
 from turbogs_plugin.train.loop import Listener, TrainingLoop
 from turbogs_plugin.train.metrics import Evaluations
 from turbogs_plugin.train.run_files import RunFolder
+from turbogs_plugin.train.wall import WallClock, WallRecord
 
 Report = Callable[["RunSession"], object]
 """Writes the report of a finished run."""

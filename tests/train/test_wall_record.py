@@ -12,7 +12,7 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.train import inputs, run
 from turbogs_plugin.train import session as sessions
-from turbogs_plugin.train.clock import WallClock, WallRecord
+from turbogs_plugin.train.wall import WallClock, WallRecord
 
 pytestmark = pytest.mark.usefixtures("plotted")
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from turbogs_plugin.reconstruct.agreement import Agreement, consistent_groups, ghost_pairs
+from turbogs_plugin.reconstruct.ghosts import Agreement, consistent_groups, ghost_pairs
 from turbogs_plugin.reconstruct.solver import epipolar_distances
 
 
