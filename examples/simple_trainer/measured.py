@@ -4,7 +4,8 @@
 
 The clock starts where the trainer's does and stands still during evaluations. Checkpoints and pictures are not written.
 Decoded training photos stay on the GPU, unless MEASURED_LOADER is ``own``: then the trainer's four loader processes
-read them. MEASURED_SEED takes the place of the trainer's 42.
+read them. MEASURED_SEED takes the place of the trainer's 42. MEASURED_PICTURES="VIEW 1 3 10" writes RECORD_1.png and so
+on: test view VIEW as the model shows it after 1, 3 and 10 seconds of training; the run ends after the last one.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ import runpy
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
+from PIL import Image
 from stand_ins import stand_in, without_gpu
 
 GPU = torch.cuda.is_available()
@@ -46,6 +48,7 @@ class Recorder:
         self.file = file
         self.record: dict[str, Any] = {"stand_ins": missing, "marks": []}
         self.paused = self.began = 0.0
+        self.view, *self.due = map(int, os.environ.get("MEASURED_PICTURES", "0").split())
 
     def start(self) -> float:
         torch.cuda.synchronize()
@@ -65,6 +68,40 @@ class Recorder:
         torch.cuda.synchronize()
         self.paused += time.time() - stopped
 
+    def watched(self, steps: Iterable[int], runner: Any) -> Iterator[int]:
+        """The trainer's steps, with a picture between two of them wherever one is due."""
+        pictures = bool(self.due)
+        for step in steps:
+            yield step
+            if self.due and time.time() - self.began - self.paused >= self.due[0]:
+                self.picture(runner, step)
+                if not self.due:
+                    return
+        while pictures and self.due:
+            self.picture(runner, step)
+
+    @torch.no_grad()
+    def picture(self, runner: Any, step: int) -> None:
+        """The first picture that is due, off the clock."""
+        torch.cuda.synchronize()
+        stopped = time.time()
+        item = runner.valset[self.view]
+        truth = item["image"].to(runner.device) / 255.0
+        height, width = truth.shape[:2]
+        where = {"camtoworlds": item["camtoworld"][None].to(runner.device), "Ks": item["K"][None].to(runner.device)}
+        planes = {"near_plane": runner.cfg.near_plane, "far_plane": runner.cfg.far_plane}
+        colors = runner.rasterize_splats(
+            **where, width=width, height=height, sh_degree=runner.cfg.sh_degree, **planes, masks=None
+        )[0][0].clamp(0, 1)
+        mark = self.due.pop(0)
+        psnr = -10 * float((colors - truth).square().mean().log10())
+        taken = {"mark": mark, "step": step + 1, "seconds": stopped - self.began - self.paused, "psnr": psnr}
+        self.record.setdefault("pictures", []).append(taken)
+        file = self.file.with_name(f"{self.file.stem}_{mark}.png")
+        Image.fromarray((255 * colors).round().byte().cpu().numpy()).save(file)
+        self.file.write_text(json.dumps(self.record))
+        self.paused += time.time() - stopped
+
 
 def instrumented(source: str) -> str:
     """The trainer's source with a recorder in it.
@@ -77,6 +114,7 @@ def instrumented(source: str) -> str:
         "global_tic = time.time()": "global_tic = recorder.start()",
         "                self.eval(step)\n": "                recorder.evaluate(self, step)\n",
         "                torch.save(\n": "                (lambda *nothing: None)(\n",
+        "        for step in pbar:\n": "        for step in recorder.watched(pbar, self):\n",
         "num_workers=1": "num_workers=0",  # test photos: starting a process at each evaluation takes seconds
     }
     for old, new in replacements.items():
