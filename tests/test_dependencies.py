@@ -106,7 +106,7 @@ COMMANDS = {
     "report": "STUDY",
     "demo": "CAPTURE",
     "ablate": "components --scene SCENE --out STUDY",
-    "bench": "step --scene SCENE --ply MODEL --device cpu",
+    "bench": "step --scene SCENE --ply MODEL train.device=cpu",
 }
 ALL_COMMANDS = """
 import contextlib, io, json
@@ -200,11 +200,9 @@ def test_the_core_changes_no_package_of_a_host(host, project):
 
 def test_an_extra_is_the_one_that_its_message_names(project):
     from turbogs_plugin.export import renders
-    from turbogs_plugin.report import tensorboard
     from turbogs_plugin.viewer import server
 
     extras = {"viewer": ("viser", server), "video": ("imageio-ffmpeg", renders)}
-    extras["tensorboard"] = ("tensorboard", tensorboard)
     for extra, (package, module) in extras.items():
         assert set(requirements(project["optional-dependencies"][extra])) == {package}
         assert shlex.split(module.INSTALL) == ["pip", "install", *project["optional-dependencies"][extra]]

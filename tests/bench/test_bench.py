@@ -83,7 +83,7 @@ def test_contributions_are_the_set_bits_of_the_walked_masks():
 
 def bench(turbogs, what: str, out: Path, *options: object) -> tuple[str, dict]:
     """What a bench prints, and its file."""
-    code, printed, error = turbogs("bench", what, *options, "--out", out, "--device", "cpu")
+    code, printed, error = turbogs("bench", what, *options, "--out", out, "train.device=cpu")
     assert code == 0 and str(out) in printed, error
     return printed, json.loads(out.read_text())
 
@@ -92,7 +92,7 @@ def test_bench_step_says_what_it_measured_on(turbogs, capture, ply, tmp_path):
     sizes = ("--gaussians", 500, "--views", 3, 2, "--repeats", 1)
     options = ("--scene", capture, "--ply", ply, *sizes, "train.sh_degree=1")
     printed, report = bench(turbogs, "step", tmp_path / "step.json", *options)
-    assert "M=500 K=3" in printed and report["overrides"] == ["train.sh_degree=1"]
+    assert "M=500 K=3" in printed and report["overrides"] == ["train.sh_degree=1", "train.device=cpu"]
     assert report["device"] == "cpu" and "reference" in report["provenance"]["kernels"]
     assert [entry["views"] for entry in report["passes"]] == [3, 2]
     for entry in report["passes"]:
@@ -124,5 +124,5 @@ def test_bench_raster_says_what_it_measured_on(turbogs, capture, ply, tmp_path):
 )
 def test_bad_calls_are_refused(turbogs, capture, ply, call, word):
     words = call.replace("CAPTURE", str(capture)).replace("PLY", str(ply)).split()
-    code, out, err = turbogs("bench", *words, "--device", "cpu")
+    code, out, err = turbogs("bench", words[0], "train.device=cpu", *words[1:])
     assert code == 2 and out == "" and word in err and err.count("\n") == 1, err

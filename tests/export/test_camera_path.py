@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.export.camera_path import from_file, interpolated, orbit, through_views
+from turbogs_plugin.export.camera_path import from_file, interpolated, orbit, resized, through_views
 from turbogs_plugin.model.placement import TRANSFORMS, TURNS
 from turbogs_plugin.model.similarity import Similarity
 from turbogs_plugin.scene import Frame
@@ -128,3 +128,11 @@ def test_a_file_of_something_else_is_refused(tmp_path, change):
     (tmp_path / "a.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"a\.json"):
         from_file(tmp_path / "a.json", scene_of(Frame(np.zeros(3), 1.0)), 3)
+
+
+def test_another_size_keeps_what_is_seen_from_top_to_bottom():
+    K = torch.tensor([[50.0, 0, 22], [0, 60, 12], [0, 0, 1]])
+    cameras = Cameras(torch.eye(4)[None], K[None], np.array([[40, 24]]))
+    made = resized(cameras, 100, 48)
+    assert made.sizes.tolist() == [[100, 48]] and made.Ks[0].diag().tolist() == [100, 120, 1]
+    assert made.Ks[0, :2, 2].tolist() == [2 * 22 + (100 - 80) / 2, 24] and cameras.Ks[0, 0, 2] == 22

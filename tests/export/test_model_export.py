@@ -140,6 +140,8 @@ def test_bad_input_is_one_line(turbogs, finished, capture, tmp_path):
         (("--path", "orbit"), "--out FILE.mp4"),
         (("--path", "orbit", "--out", "a.mp4", "--depth"), "--depth"),
         (("--seconds", "3"), "--path"),
+        (("--path", "orbit", "--out", "a.mp4", "--fps", "0"), "--fps 0"),
+        (("--path", "orbit", "--out", "a.mp4", "--size", "640"), "--size '640': write WIDTHxHEIGHT"),
     ],
 )
 def test_a_film_that_cannot_be_made_is_refused(turbogs, finished, tmp_path, monkeypatch, options, words):
@@ -152,7 +154,7 @@ def test_a_film_that_cannot_be_made_is_refused(turbogs, finished, tmp_path, monk
 def test_a_film_has_the_background(model, scene, tmp_path):
     ffmpeg, look = pytest.importorskip("imageio_ffmpeg"), replace(model.own_look(), background=WHITE)
     empty = model.gaussians.map(lambda value: value[:0])
-    renders.write_film(empty, look, through_views(scene.train.cameras, 3), tmp_path / "a.mp4")
+    renders.write_film(empty, look, through_views(scene.train.cameras, 3), tmp_path / "a.mp4", 60)
     _, frame, *_ = ffmpeg.read_frames(str(tmp_path / "a.mp4"))
     assert np.frombuffer(frame, dtype=np.uint8).min() > 250
 
@@ -165,12 +167,16 @@ def test_a_film(turbogs, finished, tmp_path, path):
         (tmp_path / "path.json").write_text(json.dumps(content))
         path = tmp_path / "path.json"
     video = tmp_path / "a.mp4"
-    code, out, err = turbogs("render", finished, "--path", path, "--out", video, "--seconds", "0.1", "--device", "cpu")
+    sized = path == "orbit"
+    shape = ["--fps", "30", "--size", "48x30"] if sized else []
+    call = ["render", finished, "--path", path, "--out", video, "--seconds", "0.1", *shape, "--device", "cpu"]
+    code, out, err = turbogs(*call)
     assert code == 0 and str(video) in out, err
     reader = ffmpeg.read_frames(str(video))
     facts = next(reader)
-    assert facts["fps"] == 60 and facts["size"] == ((32, 24) if path not in ("orbit", "views") else (40, 24))
+    assert facts["fps"] == (30 if sized else 60)
+    assert facts["size"] == ((48, 30) if sized else (40, 24) if path == "views" else (32, 24))
     frames = [np.frombuffer(frame, dtype=np.uint8) for frame in reader]
-    assert len(frames) == 6
+    assert len(frames) == (3 if sized else 6)
     if path == "views":
         assert frames[0].std() > 5 and np.abs(frames[0].astype(int) - frames[5]).mean() > 1

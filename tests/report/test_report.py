@@ -16,7 +16,16 @@ from PIL import Image
 
 from turbogs_plugin.report import evaluation, images, provenance
 from turbogs_plugin.report.curves import plot_against_seconds
-from turbogs_plugin.report.images import ERROR_FULL_SCALE, GAP, depth_picture, error_picture, save_image, strip
+from turbogs_plugin.report.images import (
+    ERROR_FULL_SCALE,
+    GAP,
+    TITLE,
+    depth_picture,
+    error_picture,
+    save_image,
+    strip,
+    titled,
+)
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.report.tables import number, table
 from turbogs_plugin.train import run
@@ -37,6 +46,15 @@ def test_a_strip_is_photo_render_and_error():
     assert made.shape == (5, 3 * 7 + 2 * GAP, 3) and (made[:, 7 : 7 + GAP] == 255).all()
     assert made[2, 3].tolist() == [0, 0, 0] and made[2, 7 + GAP + 3].tolist() == [255, 255, 255]
     assert made[2, 2 * (7 + GAP) + 3].sum() > 500 > made[0, 2 * (7 + GAP)].sum()
+
+
+def test_a_strip_says_what_its_pictures_are():
+    white = np.full((5, 3 * 200 + 2 * GAP, 3), 255, np.uint8)
+    made = titled(white)
+    assert made.shape == (TITLE + 5, *white.shape[1:]) and (made[TITLE:] == 255).all()
+    assert all((made[:TITLE, left : left + 60] < 128).any() for left in (0, 200 + GAP, 2 * (200 + GAP)))
+    scale = made[TITLE // 2, 2 * (200 + GAP) + 64 :][:64].astype(int)
+    assert (np.diff(scale.sum(axis=1)) >= 0).all() and scale[0].max() < 16 and scale[-1].min() > 150
 
 
 def test_errors_have_the_colours_of_matplotlib():

@@ -62,11 +62,11 @@ def small(tmp_path) -> Path:
 
 
 SETTINGS = ("train.sh_degree=1", "schedule.min_views=1", "schedule.max_views=2", "train.evaluate_at=[]")
-SETTINGS += ("schedule.pixel_budget=0.3",)
+SETTINGS += ("schedule.pixel_budget=0.3", "train.device=cpu")
 
 
 def call(small: Path, capture: Path, out: Path, *more) -> list:
-    return ["ablate", small, *SETTINGS, "--scene", capture, "--out", out, "--device", "cpu", "--steps", "4", *more]
+    return ["ablate", small, *SETTINGS, "--scene", capture, "--out", out, "--steps", "4", *more]
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def trained(capture, tmp_path_factory) -> Path:
     """Folder of a study with the cell of `full` and seed 0. Not to be changed."""
     folder = tmp_path_factory.mktemp("trained")
     (folder / "small.yaml").write_text(SMALL)
-    choice = CellChoice([capture], only=["full"], overrides=SETTINGS, steps=4, device="cpu")
+    choice = CellChoice([capture], only=["full"], overrides=SETTINGS, steps=4)
     assert run_study(load_ablation(str(folder / "small.yaml")), choice, folder / "study") == []
     return folder / "study"
 
@@ -164,7 +164,7 @@ def test_a_cell_with_a_time_budget_is_trained_as_a_run_with_one(small, capture, 
     SimulatedTime(monkeypatch, tick=1e-9).in_iterations(monkeypatch, lambda trainer: 0.125)
     settings = (*TINY, length, "budget.time=2s")
     train(load_config("turbogs", [*settings, f"scene.path={capture}"]), tmp_path / "run")
-    choice = CellChoice([capture], only=["full"], overrides=settings, device="cpu")
+    choice = CellChoice([capture], only=["full"], overrides=settings)
     assert run_study(load_ablation(str(small)), choice, tmp_path / "study") == []
     (cell,) = StudyFolder(tmp_path / "study").read_study().results
     assert 1.6 < cell.final["seconds"] < 2.4
@@ -209,7 +209,7 @@ def test_a_cell_that_another_process_trains_is_left_to_it_until_that_dies(small,
     other = context.Process(target=claim, args=(folder, key, claimed, end), daemon=True)
     other.start()
     assert claimed.wait(60.0)
-    choice = CellChoice([capture], only=["full"], overrides=SETTINGS, steps=4, device="cpu")
+    choice = CellChoice([capture], only=["full"], overrides=SETTINGS, steps=4)
     with monkeypatch.context() as patch:
         no_training(patch)
         assert run_study(load_ablation(str(small)), choice, folder.path) == []

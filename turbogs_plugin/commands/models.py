@@ -61,6 +61,8 @@ def render(
     out: Annotated[Path | None, arg(metavar="FOLDER|FILE")] = None,
     path: Annotated[str | None, arg(metavar="orbit|views|FILE")] = None,
     seconds: Annotated[float | None, arg(metavar="SECONDS")] = None,
+    fps: Annotated[float | None, arg(metavar="N")] = None,
+    size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT")] = None,
     device: Device = "auto",
     given: Given = NO_SCENE,
 ) -> int:
@@ -73,23 +75,26 @@ def render(
         depth: also write depth images: .npy (float32, along the camera's axis, in the capture's own units; 0 where
             nothing was hit) and .png (near is bright).
         out: folder for the pictures; renders in the run's folder where absent. With --path the film's new file (.mp4).
-        path: write a film of 60 frames a second along a path: orbit, about what the capture shows; views, through its
+        path: write a film along a path: orbit, about what the capture shows; views, through its
             training cameras; or a file of cameras: transforms.json's layout, nerfstudio's path, Inria's cameras.json.
         seconds: of the film; 10 where absent.
+        fps: frames a second of the film; 60 where absent.
+        size: of the film, e.g. 1920x1080; a photo's, or the file's, where absent.
         device: where to render.
     """
-    from turbogs_plugin.export.renders import film_run, render_run
+    from turbogs_plugin.export.renders import FilmShape, film_run, render_run
 
     settings = given.settings(overrides)
     if path is None:
-        if seconds is not None:
-            raise InputError("--seconds is the length of a film: give --path and --out FILE.mp4, too")
+        if (seconds, fps, size) != (None, None, None):
+            raise InputError("--seconds, --fps and --size are of a film: give --path and --out FILE.mp4, too")
         folders = render_run(run, split, device, depth, settings, out)
         print("\n".join(f"{name:<8} {folder}" for name, folder in zip(("renders", "depths"), folders, strict=False)))
     else:
         if depth or split != "test" or out is None:
-            raise InputError("--path writes a film: it takes --out FILE.mp4 and --seconds, not --split or --depth")
-        print(f"film   {film_run(run, path, out, 10.0 if seconds is None else seconds, device, settings)}")
+            raise InputError("--path writes a film: it takes --out FILE.mp4, not --split or --depth")
+        shape = FilmShape(10.0 if seconds is None else seconds, 60.0 if fps is None else fps, size)
+        print(f"film   {film_run(run, path, out, shape, device, settings)}")
     return 0
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from turbogs_plugin.commands.options import Count, Device, Overrides, require_positive
+from turbogs_plugin.commands.options import Count, Overrides, require_positive
 from turbogs_plugin.errors import InputError
 
 
@@ -22,21 +22,19 @@ def ablate(
     steps: Count = None,
     only: Annotated[tuple[str, ...], arg(metavar="VARIANT ...")] = (),
     gpus: Count = None,
-    device: Device = "auto",
 ) -> int:
     """Train named variants over captures and seeds: error against run time. A call may be stopped at any moment; the
     same call goes on, and several calls may share the folder --out: no cell is trained twice.
 
     Args:
         name: packaged ablation (parts, components, views, ...) or .yaml file.
-        overrides: changes of every variant's configuration.
+        overrides: changes of every variant's configuration; train.device=cpu trains on the CPU.
         out: folder of the study; finished cells in it are kept.
         scene: folder of a capture; may be given several times.
         seeds: of each variant; three at least, or no difference can be called clear.
         steps: iterations of every cell; what counts iterations is scaled with them.
         only: these variants and the baseline.
         gpus: number of this machine's GPUs, each of which trains a cell at a time.
-        device: where to train.
     """
     from turbogs_plugin.study.grid import load_ablation
     from turbogs_plugin.study.run_cells import CellChoice, run_study
@@ -45,7 +43,7 @@ def ablate(
         raise InputError("ablate needs --scene SCENE: the folder of a capture")
     require_positive("--steps", steps)
     require_positive("--gpus", gpus)
-    choice = CellChoice(scene, seeds, only, overrides, steps, device)
+    choice = CellChoice(scene, seeds, only, overrides, steps)
     failures = run_study(load_ablation(name), choice, out, gpus)
     for failure in failures:
         print(f"failed  {failure}")

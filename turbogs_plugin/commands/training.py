@@ -67,7 +67,6 @@ def train(
         raise InputError(VIEWER_ON_ONE)
     from turbogs_plugin.distributed.processes import joined, launched, restarts, start
     from turbogs_plugin.report.run_report import write_report
-    from turbogs_plugin.report.tensorboard import event_writers
     from turbogs_plugin.train import run
 
     gc.freeze()  # collections during training pass over the imports' objects
@@ -80,7 +79,7 @@ def train(
         if resume is None:
             folder.require_new()
         return start(gpus, sys.argv[1:], settings.train.device)
-    page, watch = write_report if report else None, event_writers(settings)
+    page, watch = write_report if report else None, []
     with joined(settings.train.device) as ranks, ExitStack() as pages:
         live = None
         if viewer is not None:

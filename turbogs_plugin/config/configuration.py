@@ -1,6 +1,6 @@
 """The configuration of a run: dataclasses <- YAML <- dotted overrides.
 
-A YAML has one section a part. The sections `scene`, `train`, `maps`, `report` and `budget` hold the settings
+A YAML has one section a part. The sections `scene`, `train`, `maps` and `budget` hold the settings
 of a dataclass (`SECTION_CLASSES`); a strategy's section holds its ``type`` and the settings of that strategy's own
 dataclass. Defaults live in those dataclasses and nowhere else. ``base: NAME_OR_FILE`` puts a YAML on top of another; a
 file is looked for beside it. The plan of a run decides settings that are ``auto`` (`sections.AUTO_SETTINGS`).
@@ -23,7 +23,6 @@ from turbogs_plugin.config.sections import (
     AUTO_SETTINGS,
     BudgetConfig,
     MapsConfig,
-    ReportConfig,
     SceneConfig,
     TrainConfig,
     undecided,
@@ -53,7 +52,6 @@ class Config:
     density: dict[str, Any]
     optimizer: dict[str, Any]
     maps: MapsConfig
-    report: ReportConfig = field(default_factory=ReportConfig)
     budget: BudgetConfig = field(default_factory=BudgetConfig)
     raster: RasterSettings = field(default=DEFAULT_SETTINGS, metadata={"setting": False})
 

@@ -183,14 +183,6 @@ class MapsConfig:
 
 
 @dataclass
-class ReportConfig:
-    """The report. `tensorboard`: also write the history for TensorBoard, into the run's folder at each
-    evaluation; needs the extra ``tensorboard``."""
-
-    tensorboard: bool = False
-
-
-@dataclass
 class BudgetConfig:
     """What the run may take besides Gaussians, whose cap is the density control's `max_gaussians`.
 

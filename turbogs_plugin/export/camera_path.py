@@ -150,6 +150,14 @@ def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: np.ndarray, frames:
     return _cameras(made, between.reshape(-1, 3, 3), size)
 
 
+def resized(cameras: Cameras, width: int, height: int) -> Cameras:
+    """Cameras for pictures of another size, by its height: at the sides something is cut off, or more is seen."""
+    by = height / torch.from_numpy(cameras.sizes[:, 1])
+    Ks = cameras.Ks * torch.stack((by, by, torch.ones_like(by)), dim=1)[:, :, None].to(cameras.Ks)
+    Ks[:, 0, 2] += ((width - by * torch.from_numpy(cameras.sizes[:, 0])) / 2).to(Ks)
+    return Cameras(cameras.viewmats, Ks, np.tile(np.array([width, height]), (len(cameras), 1)))
+
+
 def _common_lens(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """Intrinsics [3, 3] with the picture's middle as principal point, and an even (width, height): the median camera's,
     reduced to `WIDEST_FILM`."""

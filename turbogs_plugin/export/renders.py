@@ -1,5 +1,5 @@
-"""Renders of a saved model: from its capture's cameras as PNGs, and films along a path of cameras, 60 frames a second,
-encoded by the ffmpeg of imageio-ffmpeg (`turbogs render`)."""
+"""Renders of a saved model: from its capture's cameras as PNGs, and films along a path of cameras, encoded by the
+ffmpeg of imageio-ffmpeg (`turbogs render`)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.export.camera_path import from_file, orbit, through_views
+from turbogs_plugin.export.camera_path import from_file, orbit, resized, through_views
 from turbogs_plugin.files import naming, new_file, require_new_file, require_writable, unused_name
 from turbogs_plugin.report.evaluation import open_saved, views_of
 from turbogs_plugin.report.images import depth_picture, save_image, to_uint8
@@ -23,8 +24,6 @@ from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.types import Cameras, Gaussians
 
-RATE = 60
-"""Frames a second."""
 PATHS = {"orbit": orbit, "views": through_views}
 SUFFIXES = (".mp4", ".mkv", ".mov")
 CODEC, QUALITY = "libx264", 8
@@ -80,15 +79,34 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
     return list(stems)
 
 
+@dataclass(frozen=True)
+class FilmShape:
+    """Length in seconds, frames a second, and ``WIDTHxHEIGHT`` in pixels; None: as its path's cameras have it. Raises
+    `InputError` where one of them is none."""
+
+    seconds: float = 10.0
+    fps: float = 60.0
+    size: str | None = None
+
+    def __post_init__(self) -> None:
+        for name, value, most in (("seconds", self.seconds, 3600), ("fps", self.fps, 240)):
+            if not 0 < value <= most:
+                raise InputError(f"--{name} {value:g}: it must be more than 0 and at most {most}")
+        if self.size is not None and (len(self.pixels) != 2 or not all(2 <= side <= 8192 for side in self.pixels)):
+            raise InputError(f"--size '{self.size}': write WIDTHxHEIGHT in pixels, 2 .. 8192, as 1920x1080")
+
+    @property
+    def pixels(self) -> list[int]:
+        return [int(side) for side in (self.size or "").split("x") if side.isdecimal()]
+
+
 def film_run(
-    path: Path, camera_path: str, video: Path, seconds: float, device_name: str, given: Config | None = None
+    path: Path, camera_path: str, video: Path, shape: FilmShape, device_name: str, given: Config | None = None
 ) -> Path:
     """Write a film of the model of `open_saved` into a new file, along orbit, views, or a file of cameras. Errors as of
     `open_saved`; `InputError`, too, where an option does not fit."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise InputError(f"a film needs imageio-ffmpeg: {INSTALL}")
-    if not 0 < seconds <= 3600:
-        raise InputError(f"--seconds {seconds:g}: it must be more than 0 and at most 3600")
     if camera_path not in PATHS and not Path(camera_path).is_file():
         raise InputError(f"--path '{camera_path}': it must be orbit, views, or a file of cameras")
     if video.suffix.lower() not in SUFFIXES:
@@ -96,14 +114,15 @@ def film_run(
     require_new_file(video, "--out")
     require_writable(video.parent, f"--out '{video}'")
     model, scene = open_saved(path, device_name, given)
-    frames = max(1, round(RATE * seconds))
+    frames = max(1, round(shape.fps * shape.seconds))
     along = PATHS.get(camera_path)
     cameras = along(scene.train.cameras, frames) if along else from_file(Path(camera_path), scene, frames)
-    write_film(model.gaussians, model.own_look(scene.train), cameras, video)
+    cameras = resized(cameras, *shape.pixels) if shape.size else cameras
+    write_film(model.gaussians, model.own_look(scene.train), cameras, video, shape.fps)
     return video
 
 
-def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) -> None:
+def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path, fps: float) -> None:
     """Render a model, as it looks, and encode a film. Nothing is left behind where this fails.
 
     Args:
@@ -117,7 +136,7 @@ def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path) 
 
     width, height = (cameras.sizes[0] // 2 * 2).tolist()
     cameras = cameras.to(gaussians.device)
-    options = {"fps": RATE, "codec": CODEC, "quality": QUALITY, "macro_block_size": 1, "ffmpeg_log_level": "error"}
+    options = {"fps": fps, "codec": CODEC, "quality": QUALITY, "macro_block_size": 1, "ffmpeg_log_level": "error"}
     with tempfile.TemporaryDirectory(dir=video.parent, prefix=".") as hidden:
         temporary = Path(hidden) / video.name  # ffmpeg knows the container by the suffix
         try:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from turbogs_plugin.files import naming, new_file
@@ -23,6 +23,9 @@ MASKED = 128
 
 GAP = 6
 """White pixels between the pictures of a strip."""
+
+TITLE = 24
+"""Pixels of the bar of titles above a strip."""
 
 JPEG_QUALITY = 92
 """Quality of a strip's JPEG. With full resolution of colours it looks as a PNG does, at a tenth of the size."""
@@ -47,6 +50,19 @@ def strip(photo: Tensor, image: Tensor, mask: Tensor | None = None) -> Tensor:
     if mask is not None:
         truth, errors = (torch.where(mask[:, :, None], part, MASKED) for part in (truth, errors))
     return torch.cat((truth, white, rounded(image), white, errors), dim=1)
+
+
+def titled(pixels: np.ndarray) -> np.ndarray:
+    """A strip, [H, 3 W + 2 `GAP`, 3] uint8, below a bar of `TITLE` rows: the names of its pictures, and beside that of
+    the error the scale of its colours."""
+    bar = Image.new("RGB", (pixels.shape[1], TITLE), "white")
+    draw, font, step = ImageDraw.Draw(bar), ImageFont.load_default(size=15), (pixels.shape[1] + GAP) // 3
+    for place, name in enumerate(("photo", "render", "error 0")):
+        draw.text((place * step + 4, 2), name, fill="black", font=font)
+    scale = colored(torch.linspace(0.0, 1.0, 64).expand(TITLE - 10, 64)).numpy()
+    bar.paste(Image.fromarray(scale), (2 * step + 64, 6))
+    draw.text((2 * step + 134, 2), f"{ERROR_FULL_SCALE} and more", fill="black", font=font)
+    return np.concatenate((np.asarray(bar), pixels))
 
 
 def error_picture(photo: Tensor, image: Tensor) -> Tensor:

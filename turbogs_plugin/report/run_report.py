@@ -10,7 +10,7 @@ import numpy as np
 
 from turbogs_plugin.files import read_text, write_text_atomically
 from turbogs_plugin.report.evaluation import load_lpips
-from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip
+from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip, titled
 from turbogs_plugin.report.provenance import hardware, software
 from turbogs_plugin.report.tables import ERRORS, error_columns, errors, escaped, table, views_table
 from turbogs_plugin.strategies.view_sampling import doubted
@@ -44,7 +44,7 @@ def write_report(run: RunSession) -> Path:
         for view_id in view_ids:
             image = render_view(trainer.gaussians, views, view_id, seen)
             pixels = strip(views.photos.image(view_id, seen.background), image, views.mask(view_id)).cpu().numpy()
-            save_image(pictures / f"{kind}-{view_id:03d}.jpg", pixels)
+            save_image(pictures / f"{kind}-{view_id:03d}.jpg", titled(pixels))
     from turbogs_plugin.report.curves import plot_against_seconds  # loads matplotlib
 
     seconds = [evaluation.train_seconds for evaluation in run.history]

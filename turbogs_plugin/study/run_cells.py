@@ -35,7 +35,7 @@ from turbogs_plugin.study.results import Study, StudyFolder, changes, flat_setti
 from turbogs_plugin.study.study_report import write_report
 from turbogs_plugin.train.inputs import open_scene, resolve_device
 
-OF_A_CALL = ("train.device", "train.batch_for", "report.")
+OF_A_CALL = ("train.device", "train.batch_for")
 """Beginnings of settings that may differ between a kept cell and a later call: they change no result."""
 
 
@@ -48,7 +48,6 @@ class CellChoice:
     only: Sequence[str] = ()
     overrides: Sequence[str] = ()
     steps: int | None = None
-    device: str = "auto"
 
     def configs(self, ablation: Ablation) -> dict[CellKey, Config]:
         """Configuration of each cell, capture after capture and seed after seed. Raises `InputError`."""
@@ -63,7 +62,7 @@ class CellChoice:
         configs: dict[CellKey, Config] = {}
         for path, seed, variant in itertools.product(paths, self.seeds, ablation.only(self.only)):
             config = variant_config(ablation, variant, seed, self.overrides, self.steps)
-            config.scene.path, config.train.device = str(path), resolve_device(self.device).type
+            config.scene.path, config.train.device = str(path), resolve_device(config.train.device).type
             configs[CellKey(path.name, variant, seed)] = config
             shared = next(iter(configs.values())).scene
             if config.scene.photos != shared.photos:
@@ -88,7 +87,10 @@ def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | Non
     study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
     _require_same_settings(study, configs)
     folder.write_study(Study(ablation, study.results))
-    here = provenance(resolve_device(choice.device).type)
+    device = _device(configs)
+    if gpus is not None and device.type != "cpu" and gpus > torch.cuda.device_count():
+        raise InputError(f"--gpus {gpus}: this machine has {torch.cuda.device_count()}; see 'turbogs doctor'")
+    here = provenance(device.type)
     try:
         if gpus is None:
             return train_cells(ablation, choice, folder, here)
@@ -101,7 +103,8 @@ def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | Non
 def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, here: Provenance) -> list[str]:
     """Train, in this process, the cells that the folder has not and no other process trains; what broke. Raises
     `InputError` where a capture cannot be read, or is another one than the finished cells'."""
-    device, configs = resolve_device(choice.device), choice.configs(ablation)
+    configs = choice.configs(ablation)
+    device = _device(configs)
     warm: set[tuple[str, str]] = set()  # variants and captures
     broken: list[str] = []
     for number, (key, config) in enumerate(configs.items(), 1):
@@ -129,6 +132,11 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
     return broken
 
 
+def _device(configs: dict[CellKey, Config]) -> torch.device:
+    """Of all cells: overrides say it, or auto."""
+    return torch.device(next(iter(configs.values())).train.device)
+
+
 @lru_cache(maxsize=2)  # with refined cameras and without
 def _loaded(settings: tuple[Any, ...], refine: bool) -> tuple[Scene, str, float]:
     """Capture, its digest, and the seconds in which it was loaded. It stays for the next cells."""
@@ -149,8 +157,6 @@ def _require_same_settings(study: Study, configs: dict[CellKey, Config]) -> None
 
 def _train_on_gpus(gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder, Provenance]) -> list[str]:
     """`train_cells` by a process for each GPU."""
-    if arguments[1].device != "cpu" and gpus > torch.cuda.device_count():
-        raise InputError(f"--gpus {gpus}: this machine has {torch.cuda.device_count()}; see 'turbogs doctor'")
     try:
         with ProcessPoolExecutor(gpus, multiprocessing.get_context("spawn")) as pool:
             workers = [pool.submit(_work, gpu, gpus, arguments) for gpu in range(gpus)]

@@ -27,8 +27,8 @@ class RunFolder:
         self.history, self.wall, self.metrics = path / "history.jsonl", path / "wall.json", path / "metrics.json"
         self.lock, self.owner = path / ".lock", path / ".owner"
         self.checkpoints, self.model, self.report = path / "checkpoints", path / "model.ply", path / "report.md"
-        self.renders, self.tensorboard = path / "renders", path / "tensorboard"
-        self._begun = (self.asked, self.config, self.plan, self.history, self.checkpoints, self.tensorboard)
+        self.renders = path / "renders"
+        self._begun = (self.asked, self.config, self.plan, self.history, self.checkpoints)
 
     def require_new(self) -> None:
         """Raise `InputError` if the folder cannot be made, or holds more than a run without a checkpoint leaves."""
@@ -69,7 +69,6 @@ class RunFolder:
             if new:  # what a run that failed has left
                 for file in (self.config, self.history):
                     file.unlink(missing_ok=True)
-                shutil.rmtree(self.tensorboard, ignore_errors=True)
             write_text_atomically(self.owner, f"process {os.getpid()} of {socket.gethostname()}")
             yield
         except InputError:
