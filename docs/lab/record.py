@@ -153,16 +153,17 @@ def draw(drawn: list[tuple[str, str, dict[str, list[float]]]]) -> Figure:
     """PSNR, and beside it SSIM, against seconds of training: a curve a method (name, colour, columns)."""
     figure = Figure(figsize=(11.0, 4.2), layout="constrained")
     for axis, (measure, span) in zip(figure.subplots(1, 2), (("psnr", 6.0), ("ssim", 0.12)), strict=True):
-        names: list[tuple[float, float]] = []  # each beside its curve's end, or a little below, clear of the others
+        names: list[tuple[float, float]] = []  # beside its curve's end, the first or above, the others or below
         for name, color, curve in sorted(drawn, key=lambda of: -of[2][measure][-1]):
             axis.plot(curve["seconds"], curve[measure], color=color, marker="o", markevery=[-1])
             end, place = curve["seconds"][-1], curve[measure][-1]
-            while any(abs(place - other) < 0.06 * span and 0.25 < end / at < 4.0 for at, other in names):
-                place -= 0.01 * span
+            taken = [*names, *((of["seconds"][-1], of[measure][-1]) for *_, of in drawn if of["seconds"][-1] > end)]
+            while any(abs(place - other) < 0.06 * span and 0.25 < end / at < 4.0 for at, other in taken):
+                place += 0.01 * span * (-1 if names else 1)
             names.append((end, place))
             axis.text(1.15 * end, place, name, color=color, verticalalignment="center")
         top = max(curve[measure][-1] for *_, curve in drawn)
-        axis.set(xlabel="seconds of training", xscale="log", xlim=(0.6, 320), ylim=(top - span, top + 0.06 * span))
+        axis.set(xlabel="seconds of training", xscale="log", xlim=(0.6, 320), ylim=(top - span, top + 0.08 * span))
         axis.set_title({"psnr": "test PSNR in dB", "ssim": "test SSIM"}[measure], loc="left")
         axis.set_xticks([1, 3, 10, 30, 100], ["1", "3", "10", "30", "100"])
         axis.spines[["top", "right"]].set_visible(False)
