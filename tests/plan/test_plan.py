@@ -205,7 +205,7 @@ def test_a_study_plans_each_cell(turbogs, capture, tmp_path, monkeypatch):
     changes |= {"no-ncc": ["loss.type=charbonnier"], "host-pixels": ["train.pixels_place=host"]}
     (tmp_path / "study.yaml").write_text(json.dumps({"title": "left out", "variants": changes}))
     monkeypatch.setattr(cell_module, "warm_up", lambda *arguments: None)
-    options = ["--steps", 4, "--device", "cpu", "--scene", capture, "--out", tmp_path / "study"]
+    options = ["--steps", 4, "train.device=cpu", "--scene", capture, "--out", tmp_path / "study"]
     code, _, err = turbogs("ablate", tmp_path / "study.yaml", "train.evaluate_at=[]", *options)
     assert code == 0, err
     cells = {cell.variant: cell for cell in StudyFolder(tmp_path / "study").read_study().results}
