@@ -89,6 +89,8 @@ def open_started(
         synchronize(device)  # makes CUDA's context, and takes no memory through torch
         if device.type == "cuda":
             library.unavailable_reason()  # loads it
+        import scipy.sparse.linalg, scipy.spatial  # noqa: E401, F401 - what plan and initial model would wait for
+
         return device
 
     with ThreadPoolExecutor(1) as pool:
