@@ -68,13 +68,13 @@ def test_shares_are_the_samples_in_their_order(sizes, views, count, rate, unit, 
         assert len(part.tile_ids) == len(part.tile_offsets) - 1 and int(part.tile_offsets[-1]) == len(part)
 
 
-@pytest.mark.parametrize("count", [2, 3, 4, 8])
+@pytest.mark.parametrize("count", [2, 3, 4, 7])
 @pytest.mark.parametrize("views", [1, 3, 5])
 def test_shares_are_nearly_even(views, count):
     samples = samples_of(EQUAL, views)
     sizes = [share.num_slots for share in shares_of(samples, count)]
     even, tile = len(samples) / count, 256 * 0.1
-    assert max(abs(size - even) for size in sizes) <= 2 * (NEARLY * even + tile)
+    assert max(abs(size - even) for size in sizes) <= 2 * max(NEARLY * even, 0.5 * tile)  # at either end
 
 
 @pytest.mark.parametrize("empty", [(), (0,), (1,), (2,), (0, 1), (1, 2), (0, 2), (0, 1, 2)])

@@ -81,6 +81,8 @@ def test_default_strategys_statistics_are_gsplats(views, absgrad):
     expected = states[1]["grad2d"]
     assert expected.max() > 0
     torch.testing.assert_close(states[0]["grad2d"], expected, rtol=2e-4, atol=2e-5 * float(expected.max()))
+    sums = screen_statistics(theirs, 60)
+    torch.testing.assert_close(sums.absgrad_sums if absgrad else sums.grad_sums, expected)
 
 
 def test_one_radius_of_each_gaussian_as_before_gsplat_1_5(monkeypatch):

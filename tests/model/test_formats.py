@@ -24,6 +24,7 @@ def gaussians() -> Gaussians:
     """Colours and harmonics are small, as formats of few bits have them."""
     made = random_gaussians(300, seed=3)
     made.scales, made.sh0, made.shN = made.scales - 4.0, 0.8 * made.sh0, 0.2 * made.shN.clamp(-3, 3)
+    made.opacities[:2] = torch.tensor([20.0, -20.0])  # the ends of a byte
     return made
 
 
@@ -50,6 +51,7 @@ def test_a_format_reads_back_within_its_steps(tmp_path, name):
     found, antialiased = read_again(file)
     assert antialiased == (name != "pt")
     read = Similarity.into(frame).apply(found).map(torch.Tensor.float)
+    assert read.finite_rows().all()
     mean, rotation, scale, opacity, color, harmonic = STEPS[name]
     extent = float(made.means.abs().max())
     assert float((read.means - made.means).abs().max()) <= mean * extent + 1e-6

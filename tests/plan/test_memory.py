@@ -60,6 +60,8 @@ def test_what_does_not_fit_is_said_with_the_number_that_would(capture, gaussians
     assert re.match(said or "$", note)
     if "--max" in note:
         fits = int(note.partition("--max-gaussians ")[2].split()[0])
+        sizes = scene.train.cameras.sizes, scene.test.cameras.sizes
+        assert fits == pytest.approx(MemoryDemand.of(config, *sizes).gaussians(free) * 0.95**2, abs=2)
         notes = [room_note(with_cap(config, cap), scene, free) for cap in (fits, fits + 1)]
         assert notes[0] == "" != notes[1]
 

@@ -29,7 +29,7 @@ from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.spz import HEADER, MAGIC, VERSION
 from turbogs_plugin.train import inputs, run
-from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, require_like, save_checkpoint
 from turbogs_plugin.train.saved_model import load_model, read_given
 from turbogs_plugin.types import PARAMETER_NAMES
 
@@ -72,8 +72,13 @@ def hostile_leaf(value, choice: random.Random):
 
 def test_checkpoints_with_other_values(finished, tmp_path, monkeypatch):
     """Every value of the state in turn replaced by another or left out: no model is given out that is not whole and
-    finite, and a run goes on by a step or refuses."""
-    monkeypatch.setattr(run.RunSession, "run", lambda session, *_: session.trainer.step())
+    finite, and a run refuses, or goes on by a step from a state of the same form."""
+
+    def go_on(session, *_):
+        require_like(session.state_dict(), state, str(path))
+        session.trainer.step()
+
+    monkeypatch.setattr(run.RunSession, "run", go_on)
     config = run.RunFolder(finished).read_config()
     monkeypatch.setattr(run.RunFolder, "read_config", lambda *_: copy.deepcopy(config))
     scene = load_scene(config.scene.path)

@@ -103,6 +103,7 @@ def compressed(file: Path) -> None:
 
 REFUSED = {
     "code": (lambda file: torch.save({"format": checkpoint.FORMAT, "x": Exploit()}, file), "cannot be used"),
+    "code, protocol 4": (lambda file: torch.save({"x": Exploit()}, file, pickle_protocol=4), "more than plain tensors"),
     "a bare pickle": (lambda file: file.write_bytes(pickle.dumps(Exploit())), "cannot be used"),
     "a tensor larger than its storage": (
         lambda file: torch.save({"format": checkpoint.FORMAT, "x": torch.zeros(1).expand(2**40)}, file),

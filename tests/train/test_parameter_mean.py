@@ -80,7 +80,7 @@ def test_the_lines_of_the_documentation():
 def test_the_last_share_of_a_run_counts_and_its_end_always_does():
     mean = ParameterMean(0.1, tensors(0.0))
     assert [i for i in range(1, 104) if mean.due(i, 103)] == [96, 100, 103]
-    assert mean.due(3, 3) and ParameterMean(1.0, tensors(0.0)).due(AVERAGE_EVERY, 1000)
+    assert mean.due(3, 3) and mean.due(36, 40) and ParameterMean(1.0, tensors(0.0)).due(AVERAGE_EVERY, 1000)
 
 
 def test_the_model_at_the_end_is_the_mean(averaged):
