@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import shutil
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -89,8 +90,8 @@ def open_started(
         synchronize(device)  # makes CUDA's context, and takes no memory through torch
         if device.type == "cuda":
             library.unavailable_reason()  # loads it
-        import scipy.sparse.linalg, scipy.spatial  # noqa: E401, F401 - what plan and initial model would wait for
-
+        for name in ("scipy.sparse.linalg", "scipy.spatial"):  # plan and initial model would wait for them
+            importlib.import_module(name)
         return device
 
     with ThreadPoolExecutor(1) as pool:
