@@ -7,7 +7,7 @@ it as plain tensors and numbers.
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypedDict, runtime_checkable
 
 import numpy as np
 import torch
@@ -101,6 +101,8 @@ class DensityController(Protocol):
         moves_model: `update` changes the model between events (`event_due`), too.
     """
 
+    # By "return" type checkers know that a method may be left out.
+
     moves_model: bool = False
 
     @property
@@ -110,6 +112,7 @@ class DensityController(Protocol):
 
     def setup(self, gaussians: Gaussians) -> None:
         """Called once before training, and after a resume, before `load_state_dict`."""
+        return
 
     def update(self, gaussians: Gaussians, step: Step) -> RowUpdate | None:
         """Propose a change of the set of Gaussians, or None. Called after every optimizer step."""
@@ -131,12 +134,14 @@ class DensityController(Protocol):
     def apply(self, update: RowUpdate) -> None:
         """Apply the change to the controller's own state, row by row. Called after model and optimizer have followed;
         the rows may be in another order than `update` proposed."""
+        return
 
     def state_dict(self) -> dict[str, Any]:
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load what `state_dict` gave."""
+        return
 
 
 @runtime_checkable
@@ -165,6 +170,7 @@ class GaussianOptimizer(Protocol):
 
     def setup(self, gaussians: Gaussians) -> None:
         """Allocate state for these Gaussians; called once before training, and after a resume."""
+        return
 
     def rule(self, step: Step) -> UpdateRule | None:
         """The step of this iteration as a rule, or None."""
@@ -175,9 +181,22 @@ class GaussianOptimizer(Protocol):
 
     def apply(self, update: RowUpdate) -> None:
         """Apply a change of the set of Gaussians to the state, row by row."""
+        return
 
     def state_dict(self) -> dict[str, Any]:
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load what `state_dict` gave."""
+        return
+
+
+class Strategies(TypedDict, total=False):
+    """Objects by their kind, some or none."""
+
+    schedule: SamplingSchedule
+    view_sampler: ViewSampler
+    pixel_sampler: PixelSampler
+    loss: SparseLoss
+    density: DensityController
+    optimizer: GaussianOptimizer

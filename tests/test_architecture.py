@@ -11,6 +11,7 @@ import torch
 import turbogs_plugin
 from turbogs_plugin import strategies
 from turbogs_plugin.captures.demo import write_demo_capture
+from turbogs_plugin.strategies.protocols import Strategies
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "architecture.md"
@@ -54,6 +55,8 @@ def test_imports_point_one_way():
 def test_every_built_in_strategy_is_exported():
     built_in = {place.partition(":")[2] for types in strategies.TYPES.values() for place in types.values()}
     assert built_in | {*strategies.PROTOCOLS.values()} <= set(strategies.__all__)
+    of_fit = {kind: protocol.__forward_arg__ for kind, protocol in Strategies.__annotations__.items()}
+    assert of_fit == strategies.PROTOCOLS
 
 
 def test_what_type_checkers_see_of_a_package_is_what_it_has():

@@ -209,9 +209,10 @@ def test_parameters_of_a_host_of_its_own_follow():
     names = ("means", "scales", "quats", "opacities")
     splats = torch.nn.ParameterDict({name: host.splats[name] for name in names})
     splats["features"] = torch.nn.Parameter(torch.arange(40.0)[:, None])
+    splats["features_rest"] = torch.nn.Parameter(torch.zeros(40, 0, 3))  # splatfacto's, of degree 0
     optimizers = {name: torch.optim.Adam([splats[name]]) for name in splats}
     host.strategy.step_post_backward(splats, optimizers, host.state, 3, host.info, packed=False, scene=None)
-    assert len(splats["means"]) == len(splats["features"]) > 40
+    assert len(splats["means"]) == len(splats["features"]) == len(splats["features_rest"]) > 40
 
 
 def test_what_does_not_fit_is_refused_by_name():
@@ -238,6 +239,8 @@ def test_what_does_not_fit_is_refused_by_name():
     for name, value in {"revised_opacity": True, "key_for_gradient": "x", "top_fraction": 0.0}.items():
         assert_refused(name, TurboDensityStrategy, **{name: value})
     assert Host(TurboDensityStrategy(**SOON, absgrad=False)).train(4)
+    with pytest.warns(UserWarning, match="pause_refine_after_reset=5 has no effect"):
+        TurboDensityStrategy(pause_refine_after_reset=5)
 
 
 @pytest.mark.parametrize("tells_errors", [False, True])
@@ -247,11 +250,6 @@ def test_info_of_another_model_is_refused(tells_errors):
     other, state = {name: value.detach()[:7] for name, value in host.splats.items()}, host.strategy.initialize_state()
     words = "info is of 40 Gaussians, the parameters are 7: pass the info of this step"
     assert_refused(words, host.strategy.step_post_backward, other, host.optimizers, state, 1, host.info)
-
-
-def test_a_pause_after_resets_is_no_matter():
-    with pytest.warns(UserWarning, match="pause_refine_after_reset=5 has no effect"):
-        TurboDensityStrategy(pause_refine_after_reset=5)
 
 
 def test_values_of_the_host_in_the_state_go_from_parent_to_child():

@@ -155,21 +155,14 @@ def test_gradients_that_one_member_rarely_has_are_refused(every, made):
                     member.step()
 
 
-def test_a_member_that_was_not_made_is_named():
-    members = members_of({name: value for name, value in make_splats().items() if name != "scales"}, SparseAdam())
-    assert_refused("optimizers has no 'scales'", step_all, members)
-
-
 def test_a_host_without_harmonics_has_five_members():
     """Colours in the place of band 0 take the steps that band 0 takes."""
     ends = []
     for names in ({"sh0": "sh0"}, {"colors": "sh0"}):
         values = {name: value.detach().clone() for name, value in make_splats().items() if name != "shN"}
         values |= {new: values.pop(old)[:, 0] for new, old in names.items()}
-        params, shared = (
-            {name: torch.nn.Parameter(value) for name, value in values.items()},
-            SharedOptimizer(SparseAdam()),
-        )
+        params = {name: torch.nn.Parameter(value) for name, value in values.items()}
+        shared = SharedOptimizer(SparseAdam())
         members = [shared([{"params": value, "name": name}]) for name, value in params.items()]
         for value in params.values():
             value.grad = torch.linspace(-1, 1, value.numel()).reshape(value.shape)
@@ -220,6 +213,9 @@ def test_mistakes_are_named_before_anything_moves():
     members["shN"].param_groups[0]["betas"] = (0.8, 0.9)
     del members["means"]
     assert_refused("betas and eps differ between the members", step_all, members)
+
+    members = members_of({name: value for name, value in make_splats().items() if name != "scales"}, SparseAdam())
+    assert_refused("optimizers has no 'scales'", step_all, members)
 
     for wrong in (SparseAdam, DenseAdam(), ADAM):
         assert_refused(r"SharedOptimizer takes SparseAdam\(\) or .*: got (Sparse|Dense)?Adam", SharedOptimizer, wrong)

@@ -210,8 +210,8 @@ def apply_row_update(
     for name, parameter in [*params.items()]:
         role = role_of(name, params)
         value = update.values[role] if role in update.values else parameter.detach()[update.source]
-        # In a host's own layout.
-        replaced = torch.nn.Parameter(value.reshape(-1, *parameter.shape[1:]), requires_grad=parameter.requires_grad)
+        value = value.reshape(len(value), *parameter.shape[1:])  # a host's own layout
+        replaced = torch.nn.Parameter(value, requires_grad=parameter.requires_grad)
         params[name] = replaced
         if name in optimizers:
             optimizer = optimizers[name]

@@ -84,13 +84,6 @@ def rows_of(info: dict[str, Any]) -> int | None:
     return None if info.get("gaussian_ids") is not None else info["means2d"].shape[-2]
 
 
-def _require_count(found: int, count: int) -> None:
-    """Raise `InputError` where `info` is of another number of Gaussians than the parameters."""
-    if found != count:
-        remedy = "pass the info of this step's rasterization, from before rows were added or removed"
-        raise InputError(f"info is of {found} Gaussians, the parameters are {count}: {remedy}")
-
-
 def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
     """Sums of screen gradients, of views and largest radii, in gsplat's units; the sums over pixels stay zero."""
     require_keys(info, ("means2d", "radii", "width", "height", "n_cameras", "gaussian_ids"), "info", RENDERED)
@@ -107,7 +100,9 @@ def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
     norms.append(torch.zeros_like(norms[0]) if absolute is None else (absolute * half).norm(dim=-1).float())
     if ids is None:
         visible = (radii > 0).all(dim=-1)
-        _require_count(visible.shape[-1], count)
+        if visible.shape[-1] != count:
+            remedy = "pass the info of this step's rasterization, from before rows were added or removed"
+            raise InputError(f"info is of {visible.shape[-1]} Gaussians, the parameters are {count}: {remedy}")
         ids = torch.where(visible)[-1]
         norms, radii = [norm[visible] for norm in norms], radii[visible]
     stats, ids = GaussianStats.zeros(count, means2d.device), ids.long()

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -26,6 +26,7 @@ from turbogs_plugin.plan.memory import hold_to_limit, most_views, room_note, wit
 from turbogs_plugin.plan.photo_gains import PhotoGains
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.scene.offload import place_views
+from turbogs_plugin.strategies.protocols import Strategies
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import Evaluation, rewind_history
 from turbogs_plugin.train.inputs import cpu_note, open_scene, open_started, require_device, resolve_device
@@ -38,6 +39,9 @@ from turbogs_plugin.train.session import Report, RunSession, TrainingProgress, W
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.train.wall import WallClock
 from turbogs_plugin.types import Gaussians
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 IMPORTS = "interpreter and imports"
 """The first part of the wall time."""
@@ -111,7 +115,7 @@ def fit(
     config: str | Path | Mapping[str, Any] = DEFAULT_CONFIG,
     callback: Callable[[Evaluation], object] | None = None,
     progress: bool = False,
-    **strategies: Any,
+    **strategies: Unpack[Strategies],
 ) -> Fit:
     """Train in memory: nothing is written.
 
