@@ -84,6 +84,4 @@ class Scene:
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        width, height = self.train.cameras.sizes[0]
-        views = f"{len(self.train)} + {len(self.test)} views of {width}x{height}"
-        return f"Scene '{self.name}': {views}, {len(self.points):,} points"
+        return f"Scene '{self.name}': {len(self.train)} + {len(self.test)} views, {len(self.points):,} points"
