@@ -51,9 +51,7 @@ def _contradiction(scene: Scene) -> str:
     views = scene.train
     lens = float(np.median(views.cameras.Ks[:, 0, 0].cpu().numpy() / views.cameras.sizes[:, 0]))
     if lens < SHORTEST_LENS:
-        return (
-            f"focal lengths are {lens:.2g} of the photos' width: write intrinsics in pixels, not in shares of it"
-        )
+        return f"focal lengths are {lens:.2g} of the photos' width: write intrinsics in pixels, not in shares of it"
     pixels = [_pixels(views, view_id) for view_id in evenly(len(views), MOST_PHOTOS)]
     if views.photos.transparent and not any(part[:, 3].any() for part in pixels):
         return "all photos are transparent everywhere (alpha 0): write them without alpha"
