@@ -66,7 +66,6 @@ STILL_LARGER = {
         "bundle adjustment (.18 to .5 dB); files as other programs and scripts leave them; depth maps",
     ),
     "turbogs_plugin/scene": (1_163, "the depth term of the paper: what a capture knows of depths"),
-    "turbogs_plugin/reconstruct": (851, "axes of a capture without points are checked"),
     "turbogs_plugin/export": (804, "glTF, OpenUSD and .spz 2; a local origin for UTM captures; size and rate of films"),
 }
 """Folder or modules above their budget -> lines that they have, and what pays for those beyond it. They only shrink;

@@ -60,6 +60,8 @@ def test_what_is_no_depth_stays_unknown(tmp_path):
         (np.zeros((24, 32), np.uint8), {}, "one channel of 16 bits"),
         (np.zeros((24, 32, 3), np.uint8), {}, "one channel of 16 bits"),
         (DEPTHS, {"depth_file_path": "absent.npy"}, "cannot read the depth map"),
+        (DEPTHS, {"depth_file_path": "transforms.json"}, "s.json: it is no image of a known kind; export it as"),
+        (DEPTHS, {"depth_file_path": 5}, "cannot read the depth map .*/5: "),
     ],
 )
 def test_what_is_no_map_is_refused(tmp_path, values, frame, words):

@@ -111,8 +111,9 @@ def test_damaged_numbers_are_left_out_and_counted(capture, tmp_path, file, place
         (b"property float x", b"property list uchar int x", "not a whole .ply file"),
         (b"property float nx", b"property float f_rest_9", "10 properties f_rest_"),
         (b"property float opacity", b"property float opacities", "lacks the properties opacity"),
+        (b"property float x", b"property float packed", "it has no x, y, z: of a compressed model, take what  npx"),
+        (b"ply\n", b"version https://git-lfs.github.com/spec/v1\n", "it is a pointer of Git LFS: fetch it by"),
         (b"end_header\n", b"", "not a whole .ply file"),
-        (b"ply\n", b"", "not a whole .ply file"),
     ],
 )
 def test_bad_ply_headers(tmp_path, old, new, words):

@@ -174,13 +174,16 @@ def test_one_camera_a_photo_upright_and_lying(tmp_path, kind):
         (["opensfm/reconstruction.json"], "reconstruction.json is not read, .* of OpenSfM or ODM: ns-process-data"),
         (["cameras.xml"], "cameras.xml is not read, .* of Metashape"),
         (["corrected_cameras/1.json"], "1.json is not read, .* of Polycam"),
+        (["images/1.xmp"], "1.xmp is not read, .* of RealityScan"),
+        (["1_initial/params/p_calibrated_camera_parameters.txt"], "p_.*.txt is not read, .* or Pix4D"),
+        (["distorted/sparse/0/cameras.bin"], "cameras.bin is not read, .* of COLMAP: move its folder to sparse/0"),
         ([], "has 3 photos and nothing that says where they were taken from: find the cameras by 'turbogs reconstruct"),
     ],
 )
 def test_cameras_of_other_programs_are_named(tmp_path, files, words):
     write_photos(tmp_path / "images", [pinhole(60, 40, 50.0)], NAMES[:3])
     for file in files:
-        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).write_text("{}")
     assert_refused(words, load_scene, tmp_path)
     assert holds_photos_alone(tmp_path) and other_poses(tmp_path) == other_poses(tmp_path / "images")

@@ -83,11 +83,11 @@ def test_names_of_masks(capture, file):
     assert_masked(load_scene(capture).train, half_mask() > 1)
 
 
-@pytest.mark.parametrize("name", ["{}_mask.png", "dynamic_mask_{}.png"])
+@pytest.mark.parametrize("name", ["{}_mask.png", "dynamic_mask_{}.png", "{}_depth.png"])
 def test_masks_beside_photos_that_mean_one_or_the_other_are_said(capture, name):
     write_masks(capture, [name.format(photo.stem) for photo in photos_of(capture)], half_mask(), "images")
     scene = load_scene(capture)
-    assert scene.train.masks is None and scene.notes[-1].startswith("8 masks beside the photos are not used (")
+    assert scene.train.masks is None and scene.notes[-1].startswith("8 masks or maps beside the photos are not")
 
 
 def test_photos_without_a_mask_are_whole(capture):

@@ -26,19 +26,26 @@ def posed(scene: Scene, viewmats: torch.Tensor | np.ndarray, unit: torch.Tensor 
     return replace(scene, train=replace(scene.train, cameras=cameras))
 
 
-def inverted(scene: Scene) -> Scene:
-    """The scene of a file whose poses are from camera to world."""
+def inverted(scene: Scene, *axes: np.ndarray) -> Scene:
+    """The scene of a file whose poses are from camera to world, in these axes of the world and of the cameras."""
+    first, second = axes or (np.eye(4), np.eye(4))
     poses = np.linalg.inv(scene.frame.restore_poses(scene.train.cameras.viewmats.numpy()))
-    return posed(scene, scene.frame.normalise_poses(poses))
+    return posed(scene, scene.frame.normalise_poses(first @ poses @ second))
 
 
 def shares(scene: Scene) -> Scene:
     return posed(scene, scene.train.cameras.viewmats, torch.tensor([[64.0], [48.0], [1.0]]))
 
 
-def transparent(scene: Scene) -> Scene:
-    photos = scene.train.photos
-    return replace(scene, train=replace(scene.train, photos=Photos(torch.zeros(len(photos.colors), 4), photos.sizes)))
+def even(scene: Scene, *color: int) -> Scene:
+    colors = torch.tensor([color]).repeat(len(scene.train.photos.colors), 1)
+    return replace(scene, train=replace(scene.train, photos=Photos(colors, scene.train.photos.sizes)))
+
+
+def blind(scene: Scene, *views: int) -> Scene:
+    viewmats = scene.train.cameras.viewmats.clone()
+    viewmats[list(views), 2, 3] -= 50.0  # all points are behind them
+    return posed(scene, viewmats)
 
 
 def foreign(scene: Scene, doubt: str = "") -> Scene:
@@ -49,19 +56,23 @@ def foreign(scene: Scene, doubt: str = "") -> Scene:
 CONTRADICTIONS = {
     "other axes": (lambda s: posed(s, OTHER_AXES @ s.train.cameras.viewmats.double().numpy()), "columns 2 and 3"),
     "inverse poses": (inverted, "invert each pose"),
+    "inverse poses, OpenGL's": (lambda s: inverted(s, OTHER_AXES, OTHER_AXES), "invert each pose.*round.;"),
+    "world to camera, OpenCV's": (lambda s: inverted(s, OTHER_AXES, np.eye(4)), 'invert .* write "axes": "opencv"'),
+    "photos of other cameras": (lambda s: posed(s, s.train.cameras.viewmats.roll(3, 0)), "photos do not .*one solve"),
+    "one place": (lambda s: posed(s, s.train.cameras.viewmats[:1].repeat(len(s.train), 1, 1)), "in one place"),
+    "most cameras blind": (lambda s: blind(s, 3, 4, 5, 6), "the cameras see no points"),
+    "black photos": (lambda s: even(s, 0, 0, 0), "one colour throughout"),
     "points of another scene": (foreign, "of one solve"),
     "stale frames": (lambda s: foreign(s, "poses of frames"), "poses of frames"),
     "points far away": (lambda s: replace(s, points=s.points + 100.0), "cameras see no points: .*one frame"),
     "intrinsics in shares": (shares, "in pixels"),
-    "no alpha": (transparent, "alpha 0"),
+    "no alpha": (lambda s: even(s, 0, 0, 0, 0), "alpha 0"),
 }
 
 
 def test_a_camera_that_sees_none_of_the_points_is_named(scene):
     assert unseeing_note(scene) == ""
-    viewmats = scene.train.cameras.viewmats.clone()
-    viewmats[2, :3, 3] += torch.tensor([0.0, 0.0, -50.0])  # all points are behind it
-    assert unseeing_note(posed(scene, viewmats)) == f"1 cameras see none of the points: {scene.train.names[2]}"
+    assert unseeing_note(blind(scene, 2)) == f"1 cameras see none of the points: {scene.train.names[2]}"
 
 
 @pytest.mark.parametrize("case", CONTRADICTIONS)

@@ -25,8 +25,8 @@ def depth_maps(folder: Path, views: PosedImages, unit: float) -> Maps | None:
     named: dict[str, Path] = {}
     for frame in ({**content, **frame} for frame in content.get("frames", [])):
         if frame.get(KEY) and not any(frame.get(name) for name in LENS):
-            parts, place = PureWindowsPath(frame["file_path"]).parts, folder / PureWindowsPath(frame[KEY]).as_posix()
-            named |= {"/".join(parts[first:]): place for first in range(len(parts))}
+            parts, place = PureWindowsPath(frame["file_path"]).parts, PureWindowsPath(str(frame[KEY])).as_posix()
+            named |= {"/".join(parts[first:]): folder / place for first in range(len(parts))}
 
     def cells(view: int, known: np.ndarray) -> np.ndarray | None:
         if (file := named.get(views.names[view])) is None:
@@ -47,7 +47,8 @@ def _read(path: Path) -> np.ndarray:
         with nullcontext() if npy else opened_image(path) as image:
             values = np.load(path, mmap_mode="r", allow_pickle=False).squeeze() if npy else np.asarray(image)
     except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"cannot read the depth map {path}: {str(error)[:120]}; export it as .npy or .png") from None
+        said = str(error).rpartition(f"{path}: ")[2].partition(";")[0][:120]  # without another remedy
+        raise InputError(f"cannot read the depth map {path}: {said}; export it as .npy or .png") from None
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype.itemsize < 2:
         raise InputError(f"depth map {path} has {values.dtype} of {values.shape}: export one channel of 16 bits")
     return np.asarray(values, dtype=np.float64) * (1.0 if npy else 1e-3)

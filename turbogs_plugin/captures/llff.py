@@ -76,9 +76,7 @@ def _read_table(source: Path) -> np.ndarray:
         reason = " ".join((str(error) or type(error).__name__).split())[:200]
         raise InputError(f"{source} is not a readable table: {reason}; {AGAIN}") from error
     lens, (near, far) = table[:, 4:15:5], table[:, 15:].T
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        usable = np.isfinite(lens).all(axis=1) & (lens > 0).all(axis=1)
-        usable &= np.isfinite(far) & np.isfinite(1.0 / near) & (near > 0) & (near < far)
+    usable = ((lens > 0) & np.isfinite(lens)).all(axis=1) & (near > 1e-300) & (near < far) & np.isfinite(far)
     if not usable.all():
         trouble = "no positive height, width and focal length, or bounds of depth that are not 0 < near < far"
         raise InputError(f"{source}: row {int(np.argmin(usable))} has {trouble}: {AGAIN}")

@@ -37,15 +37,16 @@ READERS: dict[str, Callable[[Path], Capture]] = {
 }
 """Readers of files of cameras that are not COLMAP's, in the order in which they are taken."""
 OTHER_POSES = {
-    "OpenSfM or ODM: ns-process-data odm, or OpenSfM's export_colmap": ("opensfm/*.json", "reconstruction*.json"),
-    "Metashape: export its cameras as COLMAP, or ns-process-data metashape": ("*.xml", "*.psx"),
-    "RealityScan: export as COLMAP, or ns-process-data realitycapture": ("*.csv", "*.rspj", "*.rcproj"),
-    "Bundler, VisualSFM or Pix4D: export as COLMAP": ("*.out", "*.nvm", "*calibrated*camera*.txt"),
-    "openMVG or Meshroom: openMVG_main_openMVG2Colmap, or export as COLMAP": ("sfm_data*", "*.sfm"),
-    "Polycam: ns-process-data polycam": ("*cameras/*.json", "keyframes/*cameras", "mesh_info.json"),
-    "Record3D: ns-process-data record3d": ("metadata.json", "EXR_RGBD"),
-    "a tracker: write its poses into a transforms.json": ("pose*.txt", "*traj*.txt", "groundtruth.txt", "*.pose.txt"),
-    "the capture of a model: use that capture": ("cameras.json",),
+    "COLMAP: move its folder to sparse/0": "*/cameras.bin */cameras.txt */*/cameras.bin */*/cameras.txt",
+    "OpenSfM or ODM: ns-process-data odm, or OpenSfM's export_colmap": "opensfm/*.json reconstruction*.json odm_*",
+    "Metashape: export its cameras as COLMAP, or ns-process-data metashape": "*.xml *.psx",
+    "others: write a transforms.json": "*pose*.txt pose/* *traj*.txt groundtruth.txt odometry.csv cameras*.npz cams/*",
+    "RealityScan: export as COLMAP, or ns-process-data realitycapture": "*.csv *.rspj *.rcproj *.xmp",
+    "Bundler, VisualSFM or Pix4D: export as COLMAP": "*.out *.nvm *calibrated*camera*.txt */*calibrated*camera*.txt",
+    "openMVG or Meshroom: openMVG_main_openMVG2Colmap, or export as COLMAP": "sfm_data* *.sfm",
+    "Polycam: ns-process-data polycam": "*cameras/*.json keyframes/*cameras mesh_info.json",
+    "Record3D: ns-process-data record3d": "metadata.json EXR_RGBD",
+    "the capture of a model: use that capture": "cameras.json",
 }
 """Files that may have cameras and are not read, by what writes them and the way from there to a capture."""
 SPLITS = ("test.txt", "train.txt", "val.txt", "split.json", "train_test_lists.json", "transforms_test.json")
@@ -280,7 +281,7 @@ def other_poses(folder: Path) -> str:
     """A line on a file of another program's cameras in a folder, or in the one that its ``images`` are of; or empty."""
     for place in (folder, folder.absolute().parent) if folder.absolute().name == IMAGES else (folder,):
         for at, (source, forms) in product(("", "*/"), OTHER_POSES.items()):
-            for file in (file for form in forms for file in place.glob(at + form)):
+            for file in (file for form in forms.split() for file in place.glob(at + form)):
                 return f"{file} is not read, which may have cameras of {source}"
     return ""
 

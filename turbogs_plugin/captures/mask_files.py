@@ -60,9 +60,9 @@ def _misnamed(parents: Iterable[Path]) -> str:
 def _beside(photos: Sequence[Path]) -> str:
     """A note on masks that lie beside photos; empty where there is none."""
     files = [file for folder in dict.fromkeys(photo.parent for photo in photos) for file in sorted(folder.iterdir())]
-    masks = [file.name for file in photo_files.maps_beside(files) if "mask" in file.name.lower()]
-    remedy = f"put them into {FOLDER}/ as {CONVENTIONS}, nonzero where a pixel counts"
-    return f"{len(masks)} masks beside the photos are not used ({masks[0]}): {remedy}" if masks else ""
+    masks = [file.name for file in photo_files.maps_beside(files)]
+    remedy = f"masks are read from {FOLDER}/ as {CONVENTIONS}, nonzero where a pixel counts"
+    return f"{len(masks)} masks or maps beside the photos are not used ({masks[0]}): {remedy}" if masks else ""
 
 
 def mask_finder(folders: Sequence[Path], photos: Path) -> Callable[[str], Path | None]:

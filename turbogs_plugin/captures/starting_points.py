@@ -32,8 +32,6 @@ def read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
     """[M, 3] float64 and [M, 3] uint8 of a cloud in a .ply, and words on it where it has no colours and is grey. A 3DGS
     model's colours are its harmonics of degree 0."""
     vertices = {name.lower().removeprefix("diffuse_"): column for name, column in read_vertices(path).items()}
-    if not {"x", "y", "z"} <= set(vertices):
-        raise InputError(f"{path} has no x, y, z: export it again, or take it out")
     points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
     for channel, share in (("red", "f_dc_0"), ("green", "f_dc_1"), ("blue", "f_dc_2")):
         if channel[0] in vertices:

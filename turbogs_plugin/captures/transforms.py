@@ -86,7 +86,8 @@ def _frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[Fra
     if not all(isinstance(frame.get("file_path"), str) for frame in frames):
         raise InputError(f"{source} has a frame without a file_path: export it again")
     shared = {key: value for key, value in content.items() if key in FOR_ALL}
-    return content, [shared | frame for frame in frames]
+    whole: list[Frame] = [shared | frame for frame in frames]
+    return content, list({repr(frame): frame for frame in whole}.values())  # of equal ones the first
 
 
 def _written(frame: Frame) -> str:
@@ -136,6 +137,7 @@ def _capture(
         lenses=lenses,
         notes=(
             f"{source} ({words}): {len(found.names)} photos{split}",
+            *(["its depth maps are for loss.depth_weight alone"] * any("depth_file_path" in frame for frame in frames)),
             *found.notes,
             *clouds_beside([scene], file, f"name one as ply_file_path in {source.name} to begin with its points"),
         ),
@@ -201,7 +203,7 @@ def _read_camera(values: Frame, photo: Path, source: Path) -> tuple[np.ndarray, 
     model = str(values.get("camera_model", FISHEYE if fisheye else "OPENCV")).upper()
     if model not in (*BROWN_MODELS, FISHEYE):
         models = ", ".join((*BROWN_MODELS, FISHEYE))
-        raise InputError(f"{owner} is a {model[:40]!r}: known are {models}; use the capture's COLMAP reconstruction")
+        raise InputError(f"{owner} is a {model[:40]!r}: known are {models}; use COLMAP's model, flat cuts of panoramas")
     bends = {key: number(key, 0.0) or 0.0 for key in BENDS}
     known = ("k1", "k2", "k3", "k4") if model == FISHEYE else ("k1", "k2", "k3", "p1", "p2")
     if unknown := " and ".join(key for key, value in bends.items() if value and key not in known):

@@ -31,6 +31,7 @@ GRID = 129  # places along either side of a pinhole image at which it is checked
 SMALLEST_SHARE = 0.1
 """A pinhole image that covers less of the photo's width or height is not one of a lens."""
 EDGE = 0.5  # pixels by which the border of the pinhole image may leave the photo
+PANORAMA_REMEDY = "cut it into perspective photos and reconstruct these (pycolmap's example panorama_sfm.py does both)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +79,7 @@ def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
     if not bent or max(size) > LARGEST_SIDE:
         return None
     if not camera.is_perspective():
-        remedy = "cut it into perspective photos and reconstruct these (pycolmap's example panorama_sfm.py does both)"
-        raise InputError(f"{owner} is {model}, a panorama: {remedy}")
+        raise InputError(f"{owner} is {model}, a panorama: {PANORAMA_REMEDY}")
     if (lens := _lens(model, size, tuple(camera.params.tolist()))) is None:
         trouble = "with parameters that are not those of a lens, or whose image folds within the photo"
         remedy = "reconstruct the capture again, with the model OPENCV_FISHEYE for a wide lens"

@@ -72,8 +72,7 @@ def read_ply(path: Path) -> tuple[Gaussians, bool]:
     if missing:
         raise InputError(
             f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}, as a mesh or a cloud of "
-            "points does: give the .ply that a 3DGS trainer exports, or of a compressed .ply what  npx "
-            "@playcanvas/splat-transform  makes of it"
+            "points does: give the .ply that a 3DGS trainer exports"
         )
     if not (count := len(vertices["x"])):
         raise InputError(f"{path} holds no Gaussians: export the model again")

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from turbogs_plugin.captures.capture import bytes_of
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
 from turbogs_plugin.model.similarity import in_capture, upright
@@ -99,7 +100,7 @@ def _unpacked(path: Path) -> tuple[int, int, int, list[np.ndarray]]:
     """Version, fractional bits, flags, and the bytes [N, ...] uint8 of the six arrays."""
     version = VERSION
     try:
-        content = path.read_bytes()
+        content = bytes_of(path)
         # Version 4 has a plain header.
         unpacker = None if content.startswith(MAGIC.to_bytes(4, "little")) else zlib.decompressobj(wbits=31)
         head = unpacker.decompress(content, HEADER.size) if unpacker else content[: HEADER.size]

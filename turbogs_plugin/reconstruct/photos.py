@@ -20,6 +20,7 @@ from turbogs_plugin.captures.decoding import decoding_threads, opened_image, req
 from turbogs_plugin.captures.load import run_folder
 from turbogs_plugin.captures.mask_files import FOLDER, mask_finder, require_mask_size
 from turbogs_plugin.captures.photo_files import find_photos, unread
+from turbogs_plugin.captures.undistort import PANORAMA_REMEDY
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import write_atomically
 
@@ -136,10 +137,7 @@ def _read(path: Path, name: str) -> PhotoFile:
         require_8_bits(image, path)
         xmp = [image.info.get(key, b"") for key in ("xmp", "XML:com.adobe.xmp")]
         if any(PANORAMA.search(text if isinstance(text, bytes) else text.encode()) for text in xmp):
-            raise InputError(
-                f"photo {path} is a panorama by its XMP (GPano): cut it into perspective photos and reconstruct these "
-                "(pycolmap's example panorama_sfm.py does both)"
-            )
+            raise InputError(f"photo {path} is a panorama by its XMP (GPano): {PANORAMA_REMEDY}")
         image.draft("RGB", (size[0] // 8, size[1] // 8))  # JPEG: whole, but at an eighth of the size
         image.load()
         status = path.stat()

@@ -10,20 +10,21 @@ from turbogs_plugin.scene.geometry import evenly, seen
 from turbogs_plugin.scene.scene import PosedImages, Scene
 
 SHORTEST_LENS = 0.05
-"""Focal length over the photo's width below which it is no number of pixels. 0.05 is a view of 169 degrees; photos are
-undistorted to 120 degrees at most."""
+"""Focal length over the photo's width below which it is no number of pixels: a view of 169 degrees or more."""
 MOST_POINTS, MOST_PHOTOS, MOST_PIXELS = 20_000, 16, 4096
 """Points, photos, and pixels of a photo that are examined, evenly spread."""
 FEWEST_PLACES = 50
-"""Places of points within the examined photos, or the number of points if that is less, below which the cameras look
-elsewhere."""
+"""Places of points in the examined photos, or points if these are fewer, below which the cameras look elsewhere."""
 CELLS = 40
 """Cells over a photo's width. The nearest point of a cell is taken for visible, the points behind it for hidden."""
-LEAST_LIKENESS, LIKENESS, FEWEST_COLORS = 0.2, 0.4, 500
-"""Likeness below which photos do not show the points, the likeness that explains it, and the places that tell. Five
-captures have 0.57 to 0.82; with inverse poses 0.08 at most, with poses of other photos or a shifted cloud 0.27."""
+LEAST_LIKENESS, DOUBTED, GAIN, LIKENESS, FEWEST_COLORS = 0.2, 0.3, 0.05, 0.4, 500
+"""Likeness below which photos do not show the points; below which they do not if other photos' poses have as much; a
+likeness that explains it, and places that tell. Five captures have 0.51 to 0.82, a gain of 0.37 to 0.80; with inverse
+poses 0.08 at most, with shuffled photos 0.28 and no gain."""
+ONE_PLACE = 1e-3  # extents: cameras nearer to each other than this stand in one place
 OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y down, z forward to x right, y up, z backward, and back
 OTHER_AXES_REMEDY = 'write "axes": "opencv" into transforms.json, or multiply columns 2 and 3 of each pose by -1'
+INVERT = "invert each pose's matrix (camera to world is taken for world to camera, or the other way round)"
 
 
 def require_agreement(scene: Scene) -> None:
@@ -39,10 +40,8 @@ def unseeing_note(scene: Scene) -> str:
     for views in () if scene.drawn_points else (scene.train, scene.test):
         viewmats, Ks = views.cameras.viewmats.cpu().numpy(), views.cameras.Ks.cpu().numpy()
         for name, viewmat, K, size in zip(views.names, viewmats, Ks, views.cameras.sizes, strict=True):
-            for step in (max(1, len(points) // MOST_POINTS), 1):  # all of them where none of some is seen
-                if len(seen(points[::step], viewmat, K, size)[0]):
-                    break
-            else:
+            steps = max(1, len(points) // MOST_POINTS), 1  # all of them where none of some is seen
+            if not any(len(seen(points[::step], viewmat, K, size)[0]) for step in steps):
                 blind.append(name)
     return f"{len(blind)} cameras see none of the points: {', '.join(blind[:3])}" if blind else ""
 
@@ -52,34 +51,39 @@ def _contradiction(scene: Scene) -> str:
     views = scene.train
     lens = float(np.median(views.cameras.Ks[:, 0, 0].cpu().numpy() / views.cameras.sizes[:, 0]))
     if lens < SHORTEST_LENS:
-        return (
-            f"focal lengths are {lens:.2g} of the photos' width, a view of nearly 180 degrees: write focal lengths and "
-            "principal points in pixels, not in shares of the photo"
-        )
-    examined = evenly(len(views), MOST_PHOTOS)
-    if views.photos.transparent and not any(_pixels(views, view_id)[:, 3].any() for view_id in examined):
+        return f"focal lengths are {lens:.2g} of the photos' width: write intrinsics in pixels, not in shares of it"
+    pixels = [_pixels(views, view_id) for view_id in evenly(len(views), MOST_PHOTOS)]
+    if views.photos.transparent and not any(part[:, 3].any() for part in pixels):
         return "all photos are transparent everywhere (alpha 0): write them without alpha"
+    if not any(np.ptp(part, axis=0).any() for part in pixels):
+        return "each photo has one colour throughout: bring back the photos that the cameras are of"
+    if (views.cameras.centers - views.cameras.centers[0]).norm(dim=1).max() < ONE_PLACE:
+        return "all cameras are in one place, from where photos tell no depth: give poses with the cameras' places"
     if scene.drawn_points:
         return ""  # nothing says where the scene is
     poses = scene.frame.restore_poses(views.cameras.viewmats.cpu().numpy())  # [V, 4, 4]
     places, correlation = likeness(scene, poses)
     what = "the cameras see no points"
-    if places >= FEWEST_COLORS and correlation < LEAST_LIKENESS:
+    rolled = likeness(scene, np.roll(poses, len(poses) // 2, axis=0))[1] if correlation < DOUBTED else 0.0
+    if places >= FEWEST_COLORS and correlation < max(LEAST_LIKENESS, min(DOUBTED, rolled + GAIN)):
         what = "photos do not show the points where the cameras see them"
     elif places >= min(FEWEST_PLACES, len(scene.points)):
         return ""
+    inverse = np.linalg.inv(poses)
     for other, remedy in (
         (OTHER_AXES @ poses, f"{OTHER_AXES_REMEDY} (its axes are others)"),
-        (np.linalg.inv(poses), "invert each pose's matrix (camera to world is taken for world to camera)"),
+        (inverse, INVERT),
+        (OTHER_AXES @ inverse @ OTHER_AXES, INVERT),
+        (inverse @ OTHER_AXES, f'{INVERT}, and write "axes": "opencv" into transforms.json'),
     ):
         if likeness(scene, other)[1] >= LIKENESS:
             return f"{what}, and with other poses they do: {remedy}"
-    return f"{what}: {scene.doubt or 'poses, points and photos must be of one solve and in one frame'}"
+    return f"{what}: {scene.doubt or 'poses, intrinsics, points and photos must be of one solve and in one frame'}"
 
 
 def likeness(scene: Scene, poses: np.ndarray) -> tuple[int, float]:
-    """Number of visible points over the examined photos, and the correlation of their colours with the photos' colours
-    there; NaN where either are all alike. `poses`: [V, 4, 4] world to camera, in the capture's coordinates."""
+    """Number of points visible in the examined photos, 0 where most show none; and the correlation of their colours
+    with the photos', NaN where either are alike. `poses`: [V, 4, 4] world to camera, in the capture's coordinates."""
     views, rows = scene.train, evenly(len(scene.points), MOST_POINTS)
     points = scene.frame.restore_points(scene.points[rows].double().cpu().numpy())  # [M, 3]
     own = scene.point_colors[rows].cpu().numpy().astype(np.float64)  # [M, 3]
@@ -98,7 +102,7 @@ def likeness(scene: Scene, poses: np.ndarray) -> tuple[int, float]:
     first, second = np.concatenate(shown, axis=1)
     with np.errstate(invalid="ignore"):
         correlation = (first * second).sum() / np.sqrt((first**2).sum() * (second**2).sum())
-    return len(first), float(correlation)
+    return len(first) * (2 * sum(pair.shape[1] > 0 for pair in shown) >= len(shown)), float(correlation)
 
 
 def _pixels(views: PosedImages, view_id: int, step: int | None = None) -> np.ndarray:

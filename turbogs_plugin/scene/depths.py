@@ -56,10 +56,8 @@ class InverseDepths:
                 np.copyto(own, given, where=own == 0, casting="same_kind")
         share = np.count_nonzero(cells) * CELL**2 / cameras.sizes.prod(axis=1).sum()
         if not share:
-            raise InputError(
-                "loss.depth_weight: this capture does not say where photos show its points, nor has it depth maps: set "
-                "it to 0"
-            )
+            lacking = "this capture does not say where photos show its points, nor has it depth maps"
+            raise InputError(f"loss.depth_weight: {lacking}: set it to 0")
         return cls(torch.from_numpy(cells), torch.from_numpy(starts[:-1]), min(1.0, float(share)))
 
     def to(self, device: torch.device | str) -> InverseDepths:

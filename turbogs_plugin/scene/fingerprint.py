@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 
@@ -40,10 +39,9 @@ def capture_difference(saved: dict[str, Any], present: dict[str, Any]) -> str:
 
 
 def _views_state(views: PosedImages) -> dict[str, Any]:
-    cameras = views.cameras
-    counts: Tensor = torch.zeros(0, dtype=torch.int64)  # without masks
+    cameras, masks = views.cameras, views.masks
     return {
-        "unmasked": counts if views.masks is None else torch.from_numpy(views.masks.pixel_counts),  # [V] int64
+        "unmasked": torch.from_numpy(masks.pixel_counts) if masks else torch.zeros(0, dtype=torch.int64),  # [V]
         "names": list(views.names),
         "sizes": torch.from_numpy(cameras.sizes),  # [V, 2] int64
         "viewmats": cameras.viewmats,  # [V, 4, 4] float32

@@ -74,9 +74,8 @@ def read_ahead(arrays: Sequence[Tensor]) -> None:
 def file_note(arrays: Sequence[Tensor], what: str) -> str:
     """A line for the user on those arrays that lie in files; empty where none does."""
     size = sum(array.nbytes for array in arrays if in_file(array))
-    return (
-        f"{what} lie in a temporary file, {_gibibytes(size)} in {_folder()}: free memory is too small" if size else ""
-    )
+    said = f"{what} lie in a temporary file, {_gibibytes(size)} in {_folder()}: free memory is too small"
+    return said if size else ""
 
 
 def free_host_bytes() -> int:

@@ -261,11 +261,8 @@ class _CopyStream:
                 self._stream.wait_event(event)
 
     def copy(self, target: Tensor, source: Tensor) -> None:
-        if self._stream is None:
-            target.copy_(source)
-            return
-        with torch.cuda.stream(self._stream):
-            target.copy_(source, non_blocking=True)
+        with torch.cuda.stream(self._stream):  # which does nothing for None
+            target.copy_(source, non_blocking=self._stream is not None)
 
     def mark(self) -> list[torch.cuda.Event]:
         """The end of the copies begun so far."""

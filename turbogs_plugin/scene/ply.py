@@ -21,7 +21,7 @@ def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
     """The ``vertex`` element of a .ply: property -> [N] values in the file's own type, in the file's order.
 
     trimesh allocates nothing before the file is known to be long enough for what its header announces. Raises
-    `InputError` where there is no such file, or its header or body is not as announced."""
+    `InputError` where there is no such file, its header or body is not as announced, or x, y and z lack."""
     from trimesh.exchange.ply import load_ply  # its import takes a second
 
     try:
@@ -37,6 +37,10 @@ def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     except Exception as error:  # of many kinds, for malformed files
         reason = " ".join(str(error).split())[:120] or type(error).__name__
+        if reason in ("no field of name x", "'x'"):
+            reason = "it has no x, y, z: of a compressed model, take what  npx @playcanvas/splat-transform  makes of it"
+        elif Path(path).read_bytes().startswith(b"version https://git-lfs"):
+            reason = "it is a pointer of Git LFS: fetch it by 'git lfs pull'"
         raise InputError(f"{path} is not a whole .ply file of vertices ({reason}): copy or export it again") from None
     return columns
 
