@@ -118,7 +118,10 @@ def test_photos_without_information(variant, tmp_path, name, exposure):
     are drawn."""
     edit_photos(variant, PHOTOS[name])
     loss = "sparse_ssim" if name in ("one colour", "exposures") and not exposure else "charbonnier_ncc"
-    settings, report = (f"train.exposure={exposure}", f"loss.type={loss}"), write_report if name == "black" else None
+    settings, report = (
+        ("scene.force=true", f"train.exposure={exposure}", f"loss.type={loss}"),
+        write_report if name == "black" else None,
+    )
     outcome = train_to_the_end(variant, tmp_path / "run", *settings, report=report)
     if exposure:
         offsets = outcome.trainer.exposures.offsets
@@ -140,7 +143,7 @@ def test_identical_cameras(variant, tmp_path, copies):
     edit_model(variant, change)
     assert len(load_scene(variant).train.cameras.centers.unique(dim=0)) == (6 if copies == 2 else 1)
     # Cameras that look one way get a backdrop of 3000, which the cap counts from the start.
-    train_to_the_end(variant, tmp_path / "run", "density.max_gaussians=4500")
+    train_to_the_end(variant, tmp_path / "run", "density.max_gaussians=4500", "scene.force=true")
 
 
 def write_masks(capture: Path, keep: Callable[[int], np.ndarray]) -> None:
