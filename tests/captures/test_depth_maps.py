@@ -23,16 +23,24 @@ CELLS = UNIT / DEPTHS[1::2, 1::2]
 
 def write(folder, values, **frame):
     """Files of a capture, its map and frame; the key names the map."""
-    name = "maps/0.npy" if values.dtype.kind == "f" else "maps/0.png"
+    name = {"f8": "maps/0.npy", "f4": "maps/0.exr"}.get(values.dtype.str[1:], "maps/0.png")
     (folder / "maps").mkdir()
-    np.save(folder / name, values) if name.endswith("npy") else Image.fromarray(values).save(folder / name)
+    if name.endswith("exr"):
+        exr = pytest.importorskip("OpenEXR")
+        exr.File({"type": exr.scanlineimage}, {"Z": values, "Confidence": 0 * values}).write(str(folder / name))
+    else:
+        np.save(folder / name, values) if name.endswith("npy") else Image.fromarray(values).save(folder / name)
     frame = {"file_path": "./images/a.png", "depth_file_path": name, **frame}
     (folder / "transforms.json").write_text(json.dumps({"frames": [{"file_path": "images/b.png"}, frame]}))
     return depth_maps(folder, VIEWS, UNIT)
 
 
 @pytest.mark.parametrize("known", [0.0, 1.0], ids=["no points", "points that agree"])
-@pytest.mark.parametrize("values", [DEPTHS, (1000 * DEPTHS).round().astype(np.uint16)], ids=[".npy", ".png"])
+@pytest.mark.parametrize(
+    "values",
+    [DEPTHS, (1000 * DEPTHS).round().astype(np.uint16), DEPTHS.astype(np.float32)],
+    ids=[".npy", ".png", ".exr"],
+)
 def test_metric_maps_are_taken_as_they_are(tmp_path, values, known):
     given = write(tmp_path, values)
     assert given(1, CELLS) is None
@@ -67,6 +75,17 @@ def test_what_is_no_depth_stays_unknown(tmp_path):
 def test_what_is_no_map_is_refused(tmp_path, values, frame, words):
     with pytest.raises(InputError, match=words):
         write(tmp_path, values, **frame)(0, CELLS)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [(b"\x1f\0\0\0\x17\0\0\0", b"\xff\xff\x0f\0" * 2, "more pixels than"), (b"v/1", b"v/2", "cannot read the depth")],
+)
+def test_an_exr_that_is_none_or_swells_is_refused(tmp_path, old, new, words):
+    cells, file = write(tmp_path, DEPTHS.astype(np.float32)), tmp_path / "maps/0.exr"
+    file.write_bytes(file.read_bytes().replace(old, new))
+    with pytest.raises(InputError, match=words):
+        cells(0, CELLS)
 
 
 def test_captures_without_maps_and_photos_with_a_lens_have_none(tmp_path):

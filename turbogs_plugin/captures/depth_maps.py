@@ -1,15 +1,14 @@
 """Depth maps that a ``transforms.json`` names for its photos (nerfstudio's ``depth_file_path``): images in thousandths
-of the capture's unit, or .npy in the unit; 0 is none."""
+of the capture's unit, or .npy and .exr in the unit; 0 is none."""
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
 from turbogs_plugin.captures.capture import text_of
-from turbogs_plugin.captures.decoding import opened_image
+from turbogs_plugin.captures.decoding import ALWAYS_PIXELS, PIXELS_A_BYTE, opened_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.depths import CELL, Maps
 from turbogs_plugin.scene.scene import PosedImages
@@ -42,16 +41,34 @@ def depth_maps(folder: Path, views: PosedImages, unit: float) -> Maps | None:
 
 def _read(path: Path) -> np.ndarray:
     """[H, W] float64 depths in the capture's unit. Raises `InputError` for what is no map of 16 bits or more."""
-    npy = path.suffix.lower() == ".npy"
+    kind = path.suffix.lower()
     try:
-        with nullcontext() if npy else opened_image(path) as image:
-            values = np.load(path, mmap_mode="r", allow_pickle=False).squeeze() if npy else np.asarray(image)
-    except (OSError, ValueError, EOFError) as error:
+        if kind == ".npy":
+            values = np.load(path, mmap_mode="r", allow_pickle=False).squeeze()
+        elif kind == ".exr":
+            values = _exr(path)
+        else:
+            with opened_image(path) as image:
+                values = np.asarray(image)
+    except (OSError, ValueError, EOFError, RuntimeError) as error:
         said = str(error).rpartition(f"{path}: ")[2].partition(";")[0][:120]  # without another remedy
         raise InputError(f"cannot read the depth map {path}: {said}; export it as .npy or .png") from None
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype.itemsize < 2:
         raise InputError(f"depth map {path} has {values.dtype} of {values.shape}: export one channel of 16 bits")
-    return np.asarray(values, dtype=np.float64) * (1.0 if npy else 1e-3)
+    return np.asarray(values, dtype=np.float64) * (1.0 if kind in (".npy", ".exr") else 1e-3)
+
+
+def _exr(path: Path) -> np.ndarray:
+    """[H, W] of an OpenEXR image: its channel Z, else its first one. Raises `RuntimeError` and `ValueError`."""
+    try:
+        import OpenEXR
+    except ImportError:
+        raise InputError(f"{path} needs OpenEXR: pip install OpenEXR") from None
+    low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
+    if np.prod(high.astype(float) - low + 1) > max(ALWAYS_PIXELS, PIXELS_A_BYTE * path.stat().st_size):
+        raise ValueError("its header announces more pixels than its bytes may have")
+    channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    return channels["Z" if "Z" in channels else min(channels)].pixels
 
 
 def _fitted(given: np.ndarray, known: np.ndarray) -> np.ndarray:
