@@ -91,7 +91,7 @@ def kinds(folder: Path) -> dict[str, tuple[Path, Callable[[], object], list[Chan
         "values of .pt": (models["pt"], lambda: read_given(models["pt"]), [rezipped]),
         "checkpoint": (checkpoint, lambda: load_model(place.path, torch.device("cpu")), [damaged, rezipped]),
         "config.yaml": (place.config, lambda: RunFolder(place.path).read_config(True), [damaged]),
-        "results.json": (study.file, lambda: write_report(study), [damaged, other_json]),
+        "results.json": (study.file, lambda: study.read_study().results and write_report(study), [damaged, other_json]),
         **{
             f"{name}.bin": (capture / "sparse/0" / f"{name}.bin", scene, [damaged])
             for name in ("cameras", "images", "points3D", "frames")
