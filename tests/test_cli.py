@@ -117,10 +117,10 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
 
 def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch):
     def refused(*arguments, **options):
-        raise OSError(28, "No space left on device")
+        raise OSError(28, "No space\x1b[2J left on device")
 
     monkeypatch.setattr(captures, "write_demo_capture", refused)
-    assert_refused(turbogs("demo", tmp_path / "demo"), "the system says: No space left on device; choose another")
+    assert_refused(turbogs("demo", tmp_path / "demo"), "the system says: No space?[2J left on device; choose another")
 
 
 @pytest.mark.parametrize("order", ["SCENE train.seed=5 OPTIONS", "SCENE OPTIONS train.seed=5", "OPTIONS SCENE"])

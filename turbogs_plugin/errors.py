@@ -57,12 +57,12 @@ def refusal(error: OSError) -> str:
 
 
 def error_line(error: Exception) -> str:
-    """One line for the user about an `InputError`, a `TrainingStopped` or an OSError."""
+    """One line, without orders to a terminal, about an `InputError`, a `TrainingStopped` or an OSError."""
     said = str(error)
     if isinstance(error, OSError):
         place = "the system says" if error.filename is None else f"'{error.filename}'"
         said = f"{place}: {refusal(error)}"
-    said = " ".join(said.split())
+    said = "".join(letter if letter.isprintable() else "?" for letter in " ".join(said.split()))
     return f"turbogs: error: {said if len(said) <= LONGEST_LINE else f'{said[:800]} ... {said[-400:]}'}"
 
 

@@ -150,5 +150,5 @@ def unused_name(name: str, taken: Container[str]) -> str:
 
 
 def write_text_atomically(path: Path, text: str) -> None:
-    """`write_atomically` for UTF-8 text."""
-    write_atomically(path, lambda file: file.write(text.encode("utf-8")))
+    """`write_atomically` for UTF-8 text; half of a pair of surrogates, which JSON can name, becomes a ``?``."""
+    write_atomically(path, lambda file: file.write(text.encode("utf-8", "replace")))

@@ -32,6 +32,9 @@ from turbogs_plugin.captures import load_scene
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.formats import FORMATS
 from turbogs_plugin.scene import Frame
+from turbogs_plugin.study.results import StudyFolder
+from turbogs_plugin.study.runs import study_of_runs
+from turbogs_plugin.study.study_report import write_report
 from turbogs_plugin.train import run
 from turbogs_plugin.train.run_files import RunFolder
 from turbogs_plugin.train.saved_model import load_model, read_given
@@ -79,7 +82,8 @@ def kinds(folder: Path) -> dict[str, tuple[Path, Callable[[], object], list[Chan
     (capture / "masks").mkdir()
     mask = capture / "masks" / photo.name
     mask.write_bytes(photo.read_bytes())
-    checkpoint = next(place.checkpoints.glob("*.pt"))
+    checkpoint, study = next(place.checkpoints.glob("*.pt")), StudyFolder(folder / "study")
+    study.write_study(study_of_runs([place.path]))
     scene = lambda of=capture: load_scene(of)  # noqa: E731
     return {
         **{kind: (file, lambda file=file: read_given(file), [damaged]) for kind, file in models.items()},
@@ -87,6 +91,7 @@ def kinds(folder: Path) -> dict[str, tuple[Path, Callable[[], object], list[Chan
         "values of .pt": (models["pt"], lambda: read_given(models["pt"]), [rezipped]),
         "checkpoint": (checkpoint, lambda: load_model(place.path, torch.device("cpu")), [damaged, rezipped]),
         "config.yaml": (place.config, lambda: RunFolder(place.path).read_config(True), [damaged]),
+        "results.json": (study.file, lambda: study.read_study().results and write_report(study), [damaged, other_json]),
         **{
             f"{name}.bin": (capture / "sparse/0" / f"{name}.bin", scene, [damaged])
             for name in ("cameras", "images", "points3D", "frames")

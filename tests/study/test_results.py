@@ -83,6 +83,15 @@ def test_a_file_that_is_wrong_is_refused_by_name(folder, changed, words):
         folder.read_study()
 
 
+@pytest.mark.parametrize("changed", [{"scene": 7}, {"curve": dict.fromkeys(results.CURVE, "")}, {"final": {"x": 1e99}}])
+def test_a_cell_of_another_value_is_refused_by_name(folder, changed):
+    document = json.loads(folder.file.read_text())
+    document["cells"][1] |= changed
+    folder.file.write_text(json.dumps(document))
+    with pytest.raises(InputError, match="does not hold results of a study"):
+        folder.read_study()
+
+
 VALUES = st.sampled_from([0, 1.5, True, "", "x", [], [1, 2.0]])
 FLAT = st.dictionaries(st.sampled_from(["loss.type", "loss.rate", "density.until", "plan.x"]), VALUES)
 

@@ -72,9 +72,12 @@ def test_a_new_folder_that_another_has_written_to_and_a_lock_that_is_a_link_are_
     with pytest.raises(InputError, match="not empty"), folder.owned(new=True):
         pytest.fail("two own it")
     folder.lock.unlink(missing_ok=True)
-    folder.lock.symlink_to(victim)
-    with pytest.raises(InputError, match="is a link: remove it"), folder.owned():
-        pytest.fail("it was followed")
+    folder.renders.mkdir()
+    for place in (folder.lock, folder.checkpoints, folder.renders / "test", folder.report.with_suffix("")):
+        place.symlink_to(victim)
+        with pytest.raises(InputError, match="is a link: remove it"), folder.owned():
+            pytest.fail("it was followed")
+        place.unlink()
     assert victim.read_text() == "mine"
 
 

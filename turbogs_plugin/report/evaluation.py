@@ -47,15 +47,7 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
 
 
 def open_saved(path: Path, device_name: str, given: Config | None) -> tuple[SavedModel, Scene]:
-    """A model on a device, and its capture on the CPU.
-
-    Args:
-        path: folder of a run, whose newest model it is, or the file of a model.
-        given: the capture of a model from a file, and how to render it; None: `path` is a run.
-
-    Raises:
-        InputError: no such model, or no usable capture.
-    """
+    """`load_with_capture` of a model, on the device of a name, and of its capture, which is needed."""
     model, scene, _ = load_with_capture(path, given, resolve_device(device_name))
     assert scene is not None, "the capture is needed"
     return model, scene

@@ -14,19 +14,14 @@ from turbogs_plugin.files import naming, new_file
 
 ERROR_FULL_SCALE = 0.25
 """Mean absolute error over RGB at which an error map has its brightest colour."""
-
 FAINTEST = 0.1
 """Place of the farthest depth on the scale of colours, 0 .. 1: it can be told from black."""
-
 MASKED = 128
 """Grey of masked pixels."""
-
 GAP = 6
 """White pixels between the pictures of a strip."""
-
 TITLE = 24
 """Pixels of the bar of titles above a strip."""
-
 JPEG_QUALITY = 92
 """Quality of a strip's JPEG. With full resolution of colours it looks as a PNG does, at a tenth of the size."""
 

@@ -21,10 +21,8 @@ from turbogs_plugin.engine import library
 
 PACKAGES = ("torch", "gsplat", "numpy", "pycolmap")
 """Packages whose versions change results."""
-
 COMMIT_VARIABLE = "TURBOGS_COMMIT"
 """Environment variable that names the commit where the sources are a copy without their history."""
-
 MODIFIED = "-modified"
 """End of the commit's name where the sources differ from it."""
 

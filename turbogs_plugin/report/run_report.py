@@ -84,7 +84,7 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int, doub
     heads = (*columns.values(), "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB")
     wall = run.wall.wall_seconds
     rows = [
-        [f"{of.iteration}", f"{of.train_seconds:.1f}", *errors(of), f"{of.num_gaussians}", f"{of.memory_bytes >> 20}"]
+        [of.iteration, f"{of.train_seconds:.1f}", *errors(of), of.num_gaussians, of.memory_bytes // 2**20]
         for of in run.history
     ]
     seconds, *_, count, memory = rows[-1][1:]
@@ -137,7 +137,7 @@ From left to right: photo, render, error (mean absolute difference over RGB: bla
 ## Plan
 
 ```text
-{plan.rstrip()}
+{plan.rstrip().replace("`", "'")}
 ```
 
 ## Numerical events

@@ -17,11 +17,11 @@ FURTHER = {"own": "of the model's own colours", "refined": "by refined test came
 
 
 def escaped(text: object) -> str:
-    """A text, the name of a photo or a capture, that Markdown shows as it is: no tag, link, code or end of a cell."""
-    return re.sub(r"[\\`<\[\]|]", r"\\\g<0>", str(text))
+    """A name of a photo or a capture that Markdown shows as it is: no tag, link, code, line or end of a cell."""
+    return re.sub(r"[\\`<\[\]|]", r"\\\g<0>", " ".join(str(text).split()))
 
 
-def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+def table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
     """A Markdown table, whose cells are `escaped`."""
     header = [escaped(cell) for cell in header]
     lines = [header, ["---"] * len(header), *([escaped(cell) for cell in row] for row in rows)]

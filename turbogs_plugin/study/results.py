@@ -17,23 +17,21 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from turbogs_plugin.config.typed import build_dataclass
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, write_text_atomically
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.study.grid import Ablation, CellKey
-from turbogs_plugin.train.history import Evaluation
+from turbogs_plugin.train.history import Evaluation, measure
 from turbogs_plugin.yaml_json import parse_json
 
 FORMAT = 3
 """Version of ``results.json``: raised whenever an older version of TurboGS would misread a new file."""
-
 CURVE = {"iteration": "iteration", "seconds": "train_seconds", "gaussians": "num_gaussians"}
 CURVE |= {name: name for name in ("psnr", "ssim", "l1")}
 """Column of a cell's curve -> field of `Evaluation`."""
-
 LAST = ("worst_psnr", "refined_psnr", "refined_ssim", "nonfinite_losses", "skipped_updates")
 """Fields of the last `Evaluation` that a cell's `final` has besides the curve's columns."""
-
 DIGITS = {"seconds": 3, "psnr": 3, "ssim": 5, "l1": 6, "lpips": 5, "fps": 1}
 """Digits behind the point that the files keep of a measure, by the last word of its name."""
 
@@ -215,17 +213,21 @@ def _parsed(path: Path) -> Study:
     """Study of a file that `_text` made."""
     document = parse_json(read_text(path) or "", f"'{path}'")
     try:
-        if document["format"] != FORMAT:
-            raise InputError(f"'{path}' is of format {document['format']}: this version reads format {FORMAT}")
-        ablation = Ablation(**{entry.name: document[entry.name] for entry in fields(Ablation)})
-        provenances = [entry and Provenance(**entry) for entry in document["provenances"]]
-        results = [_result(entry, document["settings"], provenances) for entry in document["cells"]]
-    except (KeyError, TypeError, AttributeError, IndexError) as error:
+        if (version := document["format"]) == FORMAT:
+            settings = {entry.name: document[entry.name] for entry in fields(Ablation)}
+            made = [entry and build_dataclass(Provenance, entry, "provenances") for entry in document["provenances"]]
+            results = [_result(entry, document["settings"], made) for entry in document["cells"]]
+            return Study(build_dataclass(Ablation, settings, "study"), results)
+    except (KeyError, TypeError, AttributeError, IndexError, InputError) as error:
         raise InputError(f"'{path}' does not hold results of a study ({error!r}): choose a new --out") from None
-    return Study(ablation, results)
+    raise InputError(f"'{path}' is of format {version}: this version reads format {FORMAT}")
 
 
 def _result(entry: dict[str, Any], common: dict[str, Any], provenances: Sequence[Provenance | None]) -> CellResult:
-    result = CellResult(**entry | {"provenance": provenances[entry["provenance"]]})
-    curve = {name: [math.nan if value is None else value for value in result.curve[name]] for name in CURVE}
-    return replace(result, settings=with_changes(common, result.settings), curve=curve)
+    result = build_dataclass(CellResult, entry | {"provenance": None, "curve": {}, "final": {}}, "cells")
+    curve = {name: [measure(value) for value in entry["curve"][name]] for name in CURVE}
+    if len(lengths := {len(column) for column in curve.values()}) > 1 or 0 in lengths:
+        raise TypeError(f"columns of a curve have {sorted(lengths)} numbers")
+    final = {name: measure(value) for name, value in entry["final"].items()}
+    settings, made_by = with_changes(common, result.settings), provenances[entry["provenance"]]
+    return replace(result, settings=settings, curve=curve, final=final, provenance=made_by)

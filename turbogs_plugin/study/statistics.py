@@ -16,7 +16,7 @@ FEWEST_SEEDS = 3
 NOISE = 0.05
 """A difference is clear where noise alone would make as large a one in a smaller share of cases."""
 TARGET_STEP = 0.5
-"""dB between the default targets of the time to a PSNR. The highest one is what every seed of the baseline reached,
+"""dB between the targets of the time to a PSNR. The highest one is what every seed of the baseline reached,
 rounded down."""
 
 
@@ -66,14 +66,10 @@ class Difference:
         return cls(mean, error, bool(ttest_ind(own, base, equal_var=False).pvalue < NOISE))
 
 
-def seconds_to_reach(curve: Mapping[str, Sequence[float]], level: float, measure: str = "psnr") -> float:
-    """Seconds of training after which a cell first reached a level, linear between evaluations; inf if never.
-
-    Args:
-        curve: `CellResult.curve`.
-        measure: a column that rises: ``psnr`` in dB, or ``ssim``.
-    """
-    seconds, values = curve["seconds"], curve[measure]
+def seconds_to_reach(curve: Mapping[str, Sequence[float]], level: float) -> float:
+    """Seconds of training after which a cell, by its `CellResult.curve`, first reached a PSNR of `level` dB, linear
+    between evaluations; inf if never."""
+    seconds, values = curve["seconds"], curve["psnr"]
     for place, reached in enumerate(values):
         if reached >= level:
             if place == 0:
@@ -113,7 +109,7 @@ class VariantRow:
 
     def ratio(self, measure: str) -> float:
         """Mean over the baseline's mean; NaN where there is none."""
-        return self.spread(measure).mean / Spread.of(finals(self.base, measure)).mean
+        return self.spread(measure).mean / (Spread.of(finals(self.base, measure)).mean or math.nan)
 
     def seconds_to(self, psnr: float) -> list[float]:
         """Seconds in which each seed reached a PSNR in dB; inf where it never did."""
@@ -142,8 +138,8 @@ class SceneSummary:
     rows: list[VariantRow]
 
 
-def summarise(study: Study, targets: Sequence[float] = ()) -> list[SceneSummary]:
-    """Rows of each capture. `targets`: PSNRs in dB; where empty they follow from the baseline's result."""
+def summarise(study: Study) -> list[SceneSummary]:
+    """Rows of each capture, with targets by the baseline's result."""
     summaries = []
     for scene in study.scenes:
         cells = {name: results for name in study.ablation.variants if (results := study.of(scene, name))}
@@ -151,6 +147,6 @@ def summarise(study: Study, targets: Sequence[float] = ()) -> list[SceneSummary]
         rows = [VariantRow(name, results, cells.get(baseline, [])) for name, results in cells.items()]
         reached = min(finals(rows[0].base or rows[0].cells, "psnr"))
         steps = (2, 1, 0) if math.isfinite(reached) else ()
-        own = [math.floor(10 * reached) / 10 - step * TARGET_STEP for step in steps]
-        summaries.append(SceneSummary(scene, baseline, list(targets) or own, rows))
+        targets = [math.floor(10 * reached) / 10 - step * TARGET_STEP for step in steps]
+        summaries.append(SceneSummary(scene, baseline, targets, rows))
     return summaries

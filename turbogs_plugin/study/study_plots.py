@@ -22,6 +22,8 @@ LABELS = {"psnr": "test PSNR in dB", "ssim": "test SSIM"}
 """Column of a cell's curve -> label of its axis."""
 SHOWN_BELOW = {"psnr": 4.0, "ssim": 0.06}
 """An axis begins this far below the worst final result: trainings pass what is below in a moment."""
+MOST_CAPTURES = 24
+"""Captures that are drawn; tables have all."""
 FAILED_BELOW = 8.0
 """A variant that ends this many dB below the best one has failed: it does not set the axes' scale."""
 
@@ -49,6 +51,7 @@ def shown_rows(summary: SceneSummary) -> list[VariantRow]:
 
 def draw_over_time(summaries: Sequence[SceneSummary]) -> Figure:
     """PSNR and SSIM against seconds: a row a capture; mean over seeds, the standard error shaded."""
+    summaries = summaries[:MOST_CAPTURES]
     styles = _styles(summaries)
     figure = Figure(figsize=(12.0, 0.6 + 4.2 * len(summaries)), layout="constrained")
     for summary, pair in zip(summaries, figure.subplots(len(summaries), 2, squeeze=False), strict=True):

@@ -54,7 +54,7 @@ def write_report(folder: StudyFolder) -> Path:
 def report_text(study: Study, summaries: Sequence[SceneSummary]) -> str:
     """The page, in Markdown."""
     reasons = dict.fromkeys(result.lpips_reason for result in study.results if result.lpips_reason)
-    said = [HOW_TO_READ, *(f"LPIPS was not computed: {reason}." for reason in reasons)]
+    said = [HOW_TO_READ, *(f"LPIPS was not computed: {escaped(reason)}." for reason in reasons)]
     parts = [f"# {escaped(study.ablation.title)}", *(textwrap.fill(text, 120, break_on_hyphens=False) for text in said)]
     parts += [_machines(study), f"![PSNR and SSIM against seconds of training]({PLOT})"]
     for summary in summaries:

@@ -67,6 +67,13 @@ def without_nan(measured: FurtherErrors) -> dict[str, Any]:
     return {name: None if value != value else value for name, value in asdict(measured).items()}
 
 
+def measure(value: Any) -> Any:
+    """A number of a file; NaN for null. Raises `TypeError` for what is none, or finite and as large as none is."""
+    if not isinstance(value, int | float | None) or 1e15 < abs(value or 0) < math.inf:
+        raise TypeError(f"{str(value)[:40]} is no measure")
+    return math.nan if value is None else value
+
+
 def append_evaluation(path: Path, evaluation: Evaluation) -> None:
     """Add one line to a history."""
     with naming(path), open(path, "a", opener=lambda name, flags: os.open(name, flags | os.O_NOFOLLOW, 0o666)) as file:
@@ -83,10 +90,7 @@ def read_history(path: Path) -> list[Evaluation]:
             break
         try:
             found = parse_json(line, "it").items()
-            values: dict[str, Any] = {name: math.nan if value is None else value for name, value in found}
-            if not all(isinstance(value, int | float) for value in values.values()):
-                raise TypeError("not a number")
-            evaluations.append(Evaluation(**values))
+            evaluations.append(Evaluation(**{name: measure(value) for name, value in found}))
         except (ValueError, TypeError, AttributeError):
             raise InputError(f"'{path}' line {number} is not an evaluation: take that line out") from None
     return evaluations

@@ -36,6 +36,13 @@ class RunFolder:
             raise InputError(f"--out '{self.path}' is not empty: choose a new folder, or go on with a run by --resume")
         require_writable(self.path, f"--out '{self.path}'")
 
+    def require_own(self) -> None:
+        """Raise `InputError` where a folder, into which commands write, or the lock is a link out of the run."""
+        folders = (self.checkpoints, self.path / "report", self.tensorboard, self.renders, *self.renders.glob("*"))
+        for place in (self.lock, *folders):
+            if place.is_symlink():
+                raise InputError(f"'{place}' is a link: remove it")
+
     def _unclaimed(self) -> bool:
         """Whether nothing is here but what a run leaves that ended before its first checkpoint."""
         there = {*self.path.iterdir()} - {self.lock, self.owner}
@@ -51,8 +58,7 @@ class RunFolder:
         from filelock import FileLock, Timeout  # of the extra `train`
 
         self.path.mkdir(parents=new, exist_ok=True)
-        if self.lock.is_symlink():
-            raise InputError(f"'{self.lock}' is a link: remove it")
+        self.require_own()
         lock = FileLock(self.lock)
         try:
             lock.acquire(timeout=0)
@@ -65,7 +71,7 @@ class RunFolder:
             if new and not self._unclaimed():
                 raise InputError(f"--out '{self.path}' is not empty: another process has written to it meanwhile")
             if before := read_text(self.owner):
-                print(f"turbogs: {before[:80]} was killed: '{self.path}' is taken over from it", file=sys.stderr)
+                print(f"turbogs: {before[:80]!a} was killed: '{self.path}' is taken over from it", file=sys.stderr)
             if new:  # what a run that failed has left
                 for file in (self.config, self.history):
                     file.unlink(missing_ok=True)

@@ -71,6 +71,7 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
     if path.is_file():
         raise InputError(f"'{path}' is a file, not a run's folder: name the capture of a model by --scene SCENE")
     config = folder.read_config()
+    folder.require_own()
     checkpoint = latest_checkpoint(folder.checkpoints)
     if checkpoint is None:
         raise InputError(f"'{path}' has no checkpoint: let the run go on with --resume, or give its model and --scene")

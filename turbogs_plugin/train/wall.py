@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.config.typed import build_dataclass
 from turbogs_plugin.files import read_text
 from turbogs_plugin.yaml_json import parse_json
 
@@ -46,10 +46,7 @@ class WallRecord:
     def read(path: Path) -> WallRecord | None:
         """The record of a run, or None where it has none. Raises `InputError` if the file is not one."""
         text = read_text(path)
-        try:
-            return None if text is None else WallRecord(**parse_json(text, str(path)))
-        except (ValueError, TypeError):
-            raise InputError(f"'{path}' is not a record of the wall clock: remove it") from None
+        return None if text is None else build_dataclass(WallRecord, parse_json(text, f"'{path}'"), f"'{path}'")
 
     def text(self) -> str:
         """``trained 5.0 s, 9.1 s on the wall``."""
