@@ -114,7 +114,7 @@ def test_a_file_of_cameras_is_in_the_captures_coordinates(tmp_path, layout, turn
     assert np.allclose(made.Ks[:, 0, 0].numpy(), np.linspace(100, 50, 5), rtol=1e-3)
 
 
-WRONG = ({"w": None}, {"w": 0}, {"fl_x": -1.0}, {"frames": []}, {"frames": [{}]}, {"frames": [{"transform_matrix": 1}]})
+WRONG = ({"w": None}, {"w": 65535}, {"fl_x": -1.0}, {"frames": []}, {"frames": [{}]}, {"frames": [{"transform_matrix": 1}]})
 WRONG += ([{}], [1], [{"width": 9, "height": 9, "fx": 5, "rotation": [[1, 2], 3]}], {"camera_path": []})
 WRONG += ({"camera_path": [1], "render_width": 9, "render_height": 9}, {"camera_path": [{}], "camera_type": "fisheye"})
 
@@ -131,8 +131,8 @@ def test_a_file_of_something_else_is_refused(tmp_path, change):
 
 
 def test_another_size_keeps_what_is_seen_from_top_to_bottom():
-    K = torch.tensor([[50.0, 0, 22], [0, 60, 12], [0, 0, 1]])
-    cameras = Cameras(torch.eye(4)[None], K[None], np.array([[40, 24]]))
+    Ks = torch.tensor([[[50.0, 0, 22], [0, 60, 12], [0, 0, 1]]])
+    cameras = Cameras(torch.eye(4)[None], Ks, np.array([[40, 24]]))
     made = resized(cameras, 100, 48)
     assert made.sizes.tolist() == [[100, 48]] and made.Ks[0].diag().tolist() == [100, 120, 1]
     assert made.Ks[0, :2, 2].tolist() == [2 * 22 + (100 - 80) / 2, 24] and cameras.Ks[0, 0, 2] == 22

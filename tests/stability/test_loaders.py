@@ -162,6 +162,7 @@ MODEL_BOMBS = {
     "lists of lists.pt": lambda: archived(pickle.dumps({"splats": doubled(list)}, 2)),
     "tuples of tuples.pt": lambda: archived(pickle.dumps({"splats": doubled(tuple)}, 2)),
     "a key of tuples.pt": lambda: archived(b"\x80\x02}" + pickle.dumps(doubled(tuple), 2)[2:-1] + b"K\x01s."),
+    "a key of tuples in tuples.pt": lambda: archived(b"\x80\x02}K\x01" + b"\x85" * 200_000 + b"K\x01s."),
     "bytes that are made.pt": lambda: called("builtins\nbytearray", 2**28),
     "a storage that is made.pt": lambda: called("torch.storage\nUntypedStorage", 2**28),
     "tensors that are nowhere.pt": meta,

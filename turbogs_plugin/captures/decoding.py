@@ -43,6 +43,7 @@ OTHER_FORMATS = {".webp": "WEBP", ".avif": "AVIF", ".jp2": "JPEG2000"}
 PIXELS_A_BYTE, ALWAYS_PIXELS = 128, 1 << 25
 """Most pixels of an image for each byte of its file, and pixels that any file may have: files of a few kilobytes can
 unpack to gigabytes. A photo has 1 to 20 pixels a byte, an even grey one of JPEG 64."""
+MOST_SCANS = 200  # of a progressive JPEG, each of which goes over all pixels; programs write about ten
 MOST_THREADS = 16
 """Photos that are decoded at a time; undistorted and reduced, each takes up to 24 bytes a pixel."""
 
@@ -166,6 +167,8 @@ def opened_image(
             if image.width * image.height > max(pixels, PIXELS_A_BYTE * stored):
                 size = f"{image.width}x{image.height} pixels in {stored} bytes"
                 raise InputError(f"{what} {path} has {size}, which no {what} has: replace it or take it out")
+            if image.info.get("progressive") and path.read_bytes().count(b"\xff\xda") > MOST_SCANS:
+                raise InputError(f"{what} {path} is a JPEG of more than {MOST_SCANS} scans: save it again")
             if image.format == "TIFF" and image.getexif().get(ExifTags.Base.Orientation, 1) != 1:
                 upright = "take that out, or save it upright before cameras are found"
                 raise InputError(f"{what} {path} is a TIFF with an orientation in its EXIF data: {upright}")

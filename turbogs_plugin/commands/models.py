@@ -103,7 +103,7 @@ def export(
     overrides: Overrides = (),
     /,
     *,
-    format: Annotated[str, arg(metavar="ply|pt|spz|spz2|splat|glb|usda|html")] = "ply",
+    format: Annotated[str, arg(metavar="ply|pt|spz|spz2|glb|usda|html")] = "ply",
     out: Path | None = None,
     max_gaussians: Count = None,
     cameras: FlagCreatePairsOff[bool] = False,
@@ -117,8 +117,8 @@ def export(
         overrides: with --scene, as in eval.
         format: ply: as the original 3DGS writes it, which viewers read. pt: a checkpoint of gsplat's simple_trainer,
             which needs --no-normalize-world-space to take it. spz: smaller, with some loss; spz2: its older version;
-            splat: one colour each. glb: glTF with KHR_gaussian_splatting. usda: OpenUSD's
-            ParticleField3DGaussianSplat. html: a page with the model to turn in a browser, without a network.
+            glb: glTF with KHR_gaussian_splatting. usda: OpenUSD's ParticleField3DGaussianSplat. html: a page with the
+            model to turn in a browser, without a network.
         out: new file; export.ply, model.pt, ..., or model.html in the run's folder where absent.
         max_gaussians: largest number of Gaussians; those are kept that add most to the training views.
         cameras: give each photo of a capture a refined camera of its own, and write a capture to train on, with

@@ -11,7 +11,6 @@ import torch
 
 from turbogs_plugin.captures.capture import text_of
 from turbogs_plugin.captures.transforms import number_of, opengl_viewmat, pinhole, read_frames
-from turbogs_plugin.captures.undistort import LARGEST_SIDE
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.placement import out_of_nerfstudio
 from turbogs_plugin.model.similarity import Similarity
@@ -27,6 +26,8 @@ SWING = math.pi
 """Largest gap in radians between cameras that surround what they look at; beyond it an orbit swings."""
 WIDEST_FILM = 1920
 """Pixels of the longer side of a film from the capture's cameras; a file's cameras have their own size."""
+LARGEST_FILM = 4096
+"""Pixels of a side of any film: an image of 8192 x 8192 would take minutes and gigabytes."""
 
 
 def orbit(cameras: Cameras, frames: int) -> Cameras:
@@ -86,8 +87,8 @@ def _camera(values: dict[str, Any], path: Path, place: int) -> tuple[np.ndarray,
     """World to camera [4, 4], intrinsics [3, 3] and (width, height) [2] of a frame as ``transforms.json`` has it."""
     owner = f"{path}: camera {place}"
     size = [number_of(values, path, name) or 0.0 for name in ("w", "h")]
-    if not all(2 <= side <= LARGEST_SIDE for side in size):
-        raise InputError(f"{owner} has no size of the film: give w and h in pixels")
+    if not all(2 <= side <= LARGEST_FILM for side in size):
+        raise InputError(f"{owner} has no size of the film: give w and h in pixels, 2 .. {LARGEST_FILM}")
     K = pinhole(values, path, (size[0], size[1]))
     if K is None or K[0, 0] <= 0:
         raise InputError(f"{owner} has neither fl_x nor a camera_angle_x in 0 .. pi")

@@ -16,7 +16,7 @@ import numpy as np
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.export.camera_path import from_file, orbit, resized, through_views
+from turbogs_plugin.export.camera_path import LARGEST_FILM, from_file, orbit, resized, through_views
 from turbogs_plugin.files import naming, new_file, require_new_file, require_writable, unused_name
 from turbogs_plugin.report.evaluation import open_saved, views_of
 from turbogs_plugin.report.images import depth_picture, save_image, to_uint8
@@ -92,8 +92,10 @@ class FilmShape:
         for name, value, most in (("seconds", self.seconds, 3600), ("fps", self.fps, 240)):
             if not 0 < value <= most:
                 raise InputError(f"--{name} {value:g}: it must be more than 0 and at most {most}")
-        if self.size is not None and (len(self.pixels) != 2 or not all(2 <= side <= 8192 for side in self.pixels)):
-            raise InputError(f"--size '{self.size}': write WIDTHxHEIGHT in pixels, 2 .. 8192, as 1920x1080")
+        if self.size is not None and (
+            len(self.pixels) != 2 or not all(2 <= side <= LARGEST_FILM for side in self.pixels)
+        ):
+            raise InputError(f"--size '{self.size}': write WIDTHxHEIGHT in pixels, as 1920x1080, at most 4096")
 
     @property
     def pixels(self) -> list[int]:

@@ -26,6 +26,7 @@ PLAIN = re.compile(
     r"torch (\w+Storage|Size|device|float\d+|bfloat16|u?int\d+|bool)"
 )
 """Names that a file may call. torch allows others besides, some of which take any amount of memory."""
+MOST_TUPLES = 20_000  # a tensor has five; nested without end, a key of a dict, they end the process
 BANDS = (0, 3, 8, 15)
 """Numbers of bands of harmonics above degree 0, of the degrees 0 .. 3."""
 
@@ -43,7 +44,10 @@ def read_plain(path: Path, name: str, remedy: str = "") -> Any:
         _require_bounded(path)
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=too_large(os.path.getsize(path)))
         for tensor in _tensors(state):
-            if tensor.device.type != "cpu" or tensor.nbytes > tensor.untyped_storage().nbytes():
+            if (
+                tensor.device.type != "cpu"
+                or tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes()
+            ):
                 raise ValueError("it has a tensor that is not stored whole")
         return state
     except OSError as error:
@@ -120,7 +124,7 @@ def _require_plain(pickled: bytes) -> None:
     """Refuse values that call other names than those of `PLAIN`, and tuples in several places: nested, they are keys
     whose hash takes endless time, and values that no walk comes to the end of."""
     tuples: set[object] = set()
-    made = ""
+    made, count = "", 0
     for code, argument, _ in pickletools.genops(pickled):
         if code.name == "GLOBAL" and not PLAIN.fullmatch(str(argument)):
             raise ValueError(f"it holds more than plain tensors and values: {str(argument)[:60]}")
@@ -130,6 +134,8 @@ def _require_plain(pickled: bytes) -> None:
             raise ValueError("it has one tuple in several places")
         else:
             made = code.name
+            if (count := count + made.startswith("TUPLE")) > MOST_TUPLES:
+                raise ValueError(f"it has more than {MOST_TUPLES} tuples")
 
 
 def save_gsplat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, antialiased: bool = False) -> None:

@@ -26,8 +26,8 @@ class Frame:
         object.__setattr__(self, "scale", float(self.scale))
         if self.center.shape != (3,) or not np.isfinite(self.center).all():
             raise InputError(f"frame center is {self.center.tolist()}: it must be three finite numbers")
-        if not (np.isfinite(self.scale) and self.scale > 0):
-            raise InputError(f"frame scale is {self.scale}: it must be finite and positive")
+        if not 1e-30 < self.scale < 1e30:  # float32's range, with room
+            raise InputError(f"frame scale is {self.scale}: it must be within 1e-30 .. 1e30")
 
     @classmethod
     def around(cls, camera_centers: np.ndarray, points: np.ndarray) -> Frame:

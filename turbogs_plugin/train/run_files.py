@@ -38,7 +38,7 @@ class RunFolder:
 
     def require_own(self) -> None:
         """Raise `InputError` where a folder, into which commands write, or the lock is a link out of the run."""
-        folders = (self.checkpoints, self.path / "report", self.tensorboard, self.renders, *self.renders.glob("*"))
+        folders = (self.checkpoints, self.path / "report", self.renders, *self.renders.glob("*"))
         for place in (self.lock, *folders):
             if place.is_symlink():
                 raise InputError(f"'{place}' is a link: remove it")
