@@ -114,8 +114,8 @@ def test_a_file_of_cameras_is_in_the_captures_coordinates(tmp_path, layout, turn
     assert np.allclose(made.Ks[:, 0, 0].numpy(), np.linspace(100, 50, 5), rtol=1e-3)
 
 
-WRONG = ({"w": None}, {"w": 9999}, {"fl_x": -1}, {"frames": []}, {"frames": [{}]}, {"frames": [{"transform_matrix": 1}]})
-WRONG += ([{}], [1], [{"width": 9, "height": 9, "fx": 5, "rotation": [[1, 2], 3]}], {"camera_path": []})
+WRONG = ({"w": None}, {"w": 9999}, {"fl_x": -1.0}, {"frames": []}, {"frames": [{"transform_matrix": 1}]})
+WRONG += ({"frames": [{}]}, [{}], [1], [{"width": 9, "height": 9, "fx": 5, "rotation": [[1], 3]}], {"camera_path": []})
 WRONG += ({"camera_path": [1], "render_width": 9, "render_height": 9}, {"camera_path": [{}], "camera_type": "fisheye"})
 
 
