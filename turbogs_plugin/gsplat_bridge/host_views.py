@@ -21,7 +21,7 @@ AS_GSPLAT = "expected items as of gsplat's data sets"
 
 
 def read_items(
-    trainset: Any, name: str, white: float, convert: Callable[[Tensor], Tensor]
+    trainset: Any, name: str, white: float, convert: Callable[[np.ndarray], Tensor]
 ) -> tuple[list[dict[str, Any]], list[Tensor] | None]:
     """The items of a data set, by number, read by several threads; and [H, W] bool of each, True where a pixel counts,
     or None where no item has a mask.
@@ -29,7 +29,7 @@ def read_items(
     Args:
         trainset: V items with "image" [H, W, 3], 0 .. `white`, and perhaps "mask" [H, W].
         name: of the data set, for messages.
-        convert: of an image, 0 .. 255, what is kept of it in its item.
+        convert: of an image, float32 [H, W, 3] within 0 .. 255, what is kept of it in its item.
 
     Raises:
         InputError: it has no items by number, or cuts random patches (``patch_size``); or an image is no tensor
@@ -50,14 +50,15 @@ def read_items(
         if mask is not None and tuple(mask.shape) != tuple(image.shape[:2]):
             expected = f"{tuple(image.shape[:2])} as its image"
             raise InputError(f"{place}['mask'] has shape {tuple(mask.shape)}: expected {expected}")
-        low, high = (float(value) for value in image.aminmax())
+        values = np.asarray(image.detach().cpu(), dtype=np.float32)  # numpy has no threads that wait for each other
+        low, high = float(values.min()), float(values.max())
         if not 0 <= low <= high <= white:
             raise InputError(f"{place}['image'] has values {low:g} .. {high:g}: expected 0 .. {white:g}; see white")
         whole = torch.ones(image.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask).bool()
-        return {**item, "image": convert(image.float() * (255.0 / white)), "largest": high, "counts": whole}
+        return {**item, "image": convert(values * np.float32(255.0 / white)), "largest": high, "counts": whole}
 
     # Numbers, not iteration: a data set without __iter__ would be read past its end.
-    with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
         items = list(pool.map(read, range(len(trainset))))
     if white > 1 and max(item["largest"] for item in items) <= 1:
         raise InputError(f"{name} has images within 0 .. 1, and white is {white:g}: pass white=1")
@@ -67,7 +68,7 @@ def read_items(
 
 def posed_images(views: Any, white: float) -> PosedImages:
     """The views of a data set whose items have "image", "K" [3, 3], "camtoworld" [4, 4] and perhaps "mask" [H, W]."""
-    items, masks = read_items(views, "views", white, lambda image: image.round().to(torch.uint8).cpu())
+    items, masks = read_items(views, "views", white, lambda image: torch.from_numpy(np.rint(image).astype(np.uint8)))
     cameras = []
     for number, item in enumerate(items):
         place = f"views[{number}]"

@@ -55,8 +55,8 @@ def maps_of_photos(
         trainset: as `read_items` takes it, numbered as the trainer's image_id. Where items have a "mask", samplers draw
             no other pixel.
     """
-    items, masks = read_items(trainset, "trainset", white, lambda image: image.to(device).sum(dim=-1) / 255.0)
-    return ErrorMaps.from_images([item["image"] for item in items], masks)
+    items, masks = read_items(trainset, "trainset", white, lambda image: torch.from_numpy(image).to(device))
+    return ErrorMaps.from_images([item["image"].sum(dim=-1) / 255.0 for item in items], masks)
 
 
 def gather_pixels(images: Tensor, samples: PixelSamples) -> Tensor:
