@@ -159,7 +159,7 @@ def resolve_complete(
     for what, file in foreign.items():
         if not trusted:
             raise InputError(f"'{where}': {what} runs code that is not installed ({file}): read it, then give --trust")
-        print(f"turbogs: {what} of '{where}' runs {file}", file=sys.stderr)
+        print(f"turbogs: '{where}': {what} runs code that is not installed ({file})", file=sys.stderr)
     try:
         config = resolve(mapping, built)
     except InputError as error:
