@@ -89,11 +89,15 @@ def test_cuda_asked_for_and_absent(turbogs, capture, finished, tmp_path, monkeyp
     assert not (tmp_path / "run").exists()
 
 
-def test_a_capture_that_a_run_has_trained_on_is_not_judged_again(turbogs, finished, tmp_path, monkeypatch):
+def test_a_capture_that_a_run_has_trained_on_is_not_judged_again(turbogs, capture, finished, tmp_path, monkeypatch):
     monkeypatch.setattr(inputs, "require_agreement", lambda scene: pytest.fail("judged"))
     assert turbogs("eval", finished, "--device", "cpu")[0] == 0
     (Path(shutil.copytree(finished, tmp_path / "run")) / "report.md").unlink()
     assert turbogs("train", "--resume", tmp_path / "run")[0] == 0
+    for call in (("plan", capture), ("train", capture, "--out", tmp_path / "new")):
+        with pytest.raises(pytest.fail.Exception, match="judged"):
+            turbogs(*call, "--device", "cpu")
+    assert turbogs("plan", capture, "--device", "cpu", "scene.force=true")[0] == 0
 
 
 def test_an_output_folder_with_other_files_is_left_alone(turbogs, capture, finished, tmp_path):
@@ -213,10 +217,8 @@ def test_a_run_whose_capture_moved_goes_on_with_another_path(turbogs, finished, 
 
 def test_a_finished_run_is_evaluated_rendered_and_exported(turbogs, finished, tmp_path):
     code, out, _ = turbogs("eval", finished, "--device", "cpu")
-    assert (
-        code == 0 and re.match(r"view +PSNR +SSIM\nview_000.png +\d+\.\d\d +0\.\d{4}\n", out) and "iteration 2" in out
-    )
-    assert "LPIPS was not computed" in out and (finished / "metrics.json").is_file()
+    assert code == 0 and re.match(r"view +PSNR +SSIM\nview_000.png +\d+\.\d\d +0\.\d{4}\n", out)
+    assert "iteration 2" in out and "LPIPS was not computed" in out and (finished / "metrics.json").is_file()
     code, out, _ = turbogs("render", finished, "--device", "cpu", "--split", "train")
     images = sorted((finished / "renders" / "train").iterdir())
     assert code == 0 and len(images) == 7 and Image.open(images[0]).size == (40, 24)

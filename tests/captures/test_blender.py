@@ -16,7 +16,6 @@ from turbogs_plugin.captures import load_scene, write_demo_capture
 SIZE, ANGLE = (60, 40), 0.7
 POINTS = np.array([[0.3, 0.0, 0.1], [-0.2, 0.25, -0.3], [0.0, -0.4, 0.35]])
 SCALED = np.diag([2, 2, 2, 1]).tolist()
-SCALED = np.diag([2, 2, 2, 1]).tolist()
 SPLIT = {"train": 6, "val": 2, "test": 4}
 
 

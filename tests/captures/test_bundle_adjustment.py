@@ -94,9 +94,8 @@ def test_points_behind_a_camera_do_not_count():
     case = tracked(noise=0.0)
     rotations, translations = case.given.rotations, case.given.translations
     behind = np.random.default_rng(5).random(len(case.points)) < 0.4
-    mirrored = Tracked(
-        case.true, case.given, case.points.copy(), part(case.observations, case.observations.view_ids == 0)
-    )
+    shown = part(case.observations, case.observations.view_ids == 0)
+    mirrored = Tracked(case.true, case.given, case.points.copy(), shown)
     away = -(mirrored.points[behind] @ rotations[0].T + translations[0])  # in the camera, through its centre
     mirrored.points[behind] = (away - translations[0]) @ rotations[0]
     pixels = mirrored.seen(case.true) + 5.0 * behind[mirrored.observations.point_ids][:, None]

@@ -114,8 +114,7 @@ def test_bad_files_are_named(tmp_path, damage, words):
     ],
 )
 def test_bad_captures_are_refused(tmp_path, capture, arguments, words):
-    folder = write_capture(tmp_path / "cup", **capture)
-    assert_refused(words, load_scene, folder, **arguments)
+    assert_refused(words, load_scene, write_capture(tmp_path / "cup", **capture), **arguments)
 
 
 def test_photos_of_a_capture_name_the_capture(tmp_path, monkeypatch):
@@ -141,8 +140,7 @@ def test_of_several_models_the_largest_is_taken_and_said(tmp_path):
         folder = write_capture(tmp_path / "cup", views=views, model=f"sparse/{name}", suffix=suffix)
     scene = load_scene(folder)
     assert len(scene.train) + len(scene.test) == 9
-    said = "4 reconstructions in .*sparse: 1 is taken, the largest; 0, 2, 10 not used"
-    assert re.fullmatch(said, scene.notes[1])
+    assert re.fullmatch("4 reconstructions in .*sparse: 1 is taken, the largest; 0, 2, 10 not used", scene.notes[1])
     assert re.fullmatch("COLMAP reconstruction .*sparse/1 .binary.: 9 images, 20 points", scene.notes[0])
 
 
@@ -170,13 +168,14 @@ def test_a_point_that_is_too_far_for_float32_is_refused(tmp_path, place, refused
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
-def test_names_with_spaces(tmp_path, suffix):
+def test_names_with_spaces_in_a_flat_folder(tmp_path, suffix):
     folder = write_capture(tmp_path / "cup", suffix=suffix)
     model = pycolmap.Reconstruction(folder / "sparse/0")
     for image in model.images.values():
-        (folder / "images" / image.name).rename(folder / "images" / image.name.replace("photo", " my  photo "))
+        (folder / "images" / image.name).rename(folder / image.name.replace("photo", " my  photo "))
         image.name = image.name.replace("photo", " my  photo ")
-    (model.write_binary if suffix == ".bin" else model.write_text)(folder / "sparse/0")
+    shutil.rmtree(folder / "sparse")
+    (model.write_binary if suffix == ".bin" else model.write_text)(folder)
     capture = read_colmap(folder, *find_model(folder))
     assert capture.names == tuple(f" my  photo {view:02d}.png" for view in range(9)) and len(capture.notes) == 1
     assert capture.viewmats[3] @ [3.0, 0, -5, 1] == pytest.approx([0, 0, 0, 1])
@@ -205,12 +204,9 @@ def test_rigs(tmp_path):
     folder = write_capture(tmp_path / "cup", views=8, cameras=(camera, camera), suffix=".txt")
     w, y = np.cos(0.15), np.sin(0.15)
     (folder / "sparse/0/rigs.txt").write_text(f"# a rig\n7 2 CAMERA 1 CAMERA 2 1 {w} 0 {y} 0 1 0.5 0\n")
-    frames = "".join(
-        f"{step} 7 {np.cos(0.05 * step)} 0 {np.sin(0.05 * step)} 0 {step} 0 5 2 CAMERA 1 {2 * step + 1} CAMERA 2 "
-        f"{2 * step + 2}\n"
-        for step in range(4)
-    )
-    (folder / "sparse/0/frames.txt").write_text(frames)
+    turns = ((step, np.cos(0.05 * step), np.sin(0.05 * step)) for step in range(4))
+    frames = [f"{i} 7 {w} 0 {y} 0 {i} 0 5 2 CAMERA 1 {2 * i + 1} CAMERA 2 {2 * i + 2}\n" for i, w, y in turns]
+    (folder / "sparse/0/frames.txt").write_text("".join(frames))
     capture = read_colmap(folder, *find_model(folder))
     offset, pose = np.eye(4), np.eye(4)
     offset[:3, :3], offset[:3, 3] = rotation(0.3), [1.0, 0.5, 0.0]
@@ -237,15 +233,15 @@ def test_where_photos_were_taken_away_no_other_folder_stands_in(tmp_path, other,
         assert_refused("of which 9 are missing", load_scene, folder)
 
 
-@pytest.mark.parametrize("written", ["{}.PNG", "{}.jpg", "./{}.png", "images/{}.png", "C:\\cup\\images\\{}.png", "NFD"])
-def test_names_of_other_programs_and_machines(tmp_path, written):
+@pytest.mark.parametrize("form", ["{}", "{}.PNG", "{}.jpg", "./{}.png", "images/{}.png", "C:\\images\\{}.png", "NFD"])
+def test_names_of_other_programs_and_machines(tmp_path, form):
     """Suffix and letters, folders before the name, Windows' paths, forms of Unicode: the one rule of all captures."""
     folder = write_capture(tmp_path / "cup")
     model = pycolmap.Reconstruction(folder / "sparse/0")
     for image in model.images.values():
         name = image.name.replace("photo", "fot\u00f3")
         (folder / "images" / image.name).rename(folder / "images" / name)
-        image.name = unicodedata.normalize("NFD", name) if written == "NFD" else written.format(name[:-4])
+        image.name = unicodedata.normalize("NFD", name) if form == "NFD" else form.format(name[:-4])
     model.write_binary(folder / "sparse/0")
     scene = load_scene(folder)
     assert scene.train.names == tuple(f"fot\u00f3{view:02d}.png" for view in range(1, 8))
@@ -260,22 +256,23 @@ def exponential(word):
     return f"{float(word):e}"
 
 
-def colors_as(form):
-    return each_line(lambda words, line: " ".join([*words[:4], *(form(int(word)) for word in words[4:7]), *words[7:]]))
+def words_as(form, first, end):
+    return each_line(lambda words, line: " ".join([*words[:first], *map(form, words[first:end]), *words[end:]]))
 
 
 @pytest.mark.parametrize(
     ("file", "change"),
     [
-        ("points3D", colors_as(lambda color: f"{color}.0")),
-        ("points3D", colors_as(lambda color: f"{color / 255:.6f}")),
-        ("points3D", each_line(lambda words, line: " ".join(words[:7]))),
+        ("points3D", words_as(lambda color: f"{color}.0", 4, 7)),
+        ("points3D", words_as(lambda color: f"{int(color) / 255:.6f}", 4, 7)),
+        ("points3D", each_line(lambda words, line: " ".join(["0", *words[1:7]]))),  # nor numbers of their own
         ("cameras", lambda text: text.replace("40 24", "40.0 2.4e1").replace("PINHOLE", "pinhole")),
         ("cameras", lambda text: text.encode("utf-16")),
         ("images", lambda text: text.rstrip("\n") + "\n"),
         ("images", lambda text: "\ufeff" + text.replace("\n", "\r\n")),
         ("images", each_line(lambda words, line: line if "photo" in line else "")),
-        ("images", lambda text: each_line(lambda words, line: line)(text).replace("\n\n", "\n")),
+        ("images", words_as(lambda number: str(int(number) - 1), 0, 1)),  # from 0 on
+        ("images", words_as(lambda number: str(2 * float(number)), 1, 5)),  # quaternions of any length
         ("images", lambda text: "\n".join(line for line in text.splitlines() if "photo" in line)),
         ("images", lambda text: "\n".join("\t".join(line.split()) + " " for line in text.splitlines())),
         ("images", each_line(lambda words, line: line if "photo" in line else " ".join(map(exponential, words)))),
@@ -339,13 +336,20 @@ def test_a_list_of_test_photos_is_the_split(tmp_path, place):
     assert scene.test.names == ("photo00.png", "photo08.png") and "test.txt not used: 0 of its" in scene.notes[0]
 
 
-def test_poses_of_frames_that_images_contradict_are_said(tmp_path):
+def test_files_that_a_script_changed_alone(tmp_path):
+    """Poses of frames that images contradict are said; what names points or images that are gone does not count."""
     folder = write_capture(tmp_path / "cup", suffix=".txt")
     images = folder / "sparse/0/images.txt"
     moved = each_line(lambda words, line: " ".join([*words[:7], "9", *words[8:]]) if "photo" in line else line)
     images.write_text(moved(images.read_text()))
     scene = load_scene(folder)
     assert scene.doubt in scene.notes and scene.doubt.startswith("poses are of frames.txt, and ")
+    for file, kept in ((images, slice(2, None)), (images.with_name("points3D.txt"), slice(4, -1))):
+        file.write_text("\n".join(file.read_text().splitlines()[kept]))
+    views = load_scene(folder).test
+    assert views.names == ("photo01.png",) and views.observations.point_ids.tolist() == [*range(18)]
+    (folder / "sparse/0/rigs.txt").unlink()
+    assert load_scene(folder).doubt == "frames.txt is not used: of rigs.txt and frames.txt one is missing"
 
 
 def test_validation_photos_are_among_the_training_photos(capture):

@@ -9,7 +9,7 @@ from helpers.refusals import assert_refused
 from PIL import ExifTags, Image
 
 from turbogs_plugin.captures import decoding, load_scene
-from turbogs_plugin.captures.decoding import photo_sizes, reduced_sizes
+from turbogs_plugin.captures.decoding import load_photos, photo_sizes, reduced_sizes
 
 SIZES = np.array([[640, 480], [500, 90]])
 
@@ -66,6 +66,14 @@ def test_only_photos_are_photos(tmp_path, form, monkeypatch):
         assert decoding.photo_size(path) == (64, 48)
     else:
         assert_refused("cannot read the photo .*photo.png: it is ", decoding.photo_size, path)
+
+
+@pytest.mark.parametrize("name", ["RGB.webp", "RGB.avif", "RGB.jp2", "CMYK.jpg", "CMYK.tif", "LAB.tif", "P.png"])
+def test_photos_of_every_kind_have_their_colours(tmp_path, name):
+    pytest.importorskip("PIL.AvifImagePlugin" if "avif" in name else "PIL")  # since Pillow 11.3
+    Image.new("RGB", (8, 6), (204, 102, 51)).convert(name.split(".")[0]).save(tmp_path / name)
+    photos = load_photos([tmp_path / name], np.array([[8, 6]]), [None])
+    np.testing.assert_allclose(photos.colors, [[204, 102, 51]] * 48, atol=3)
 
 
 def test_pixels_are_compared_with_bytes_before_they_are_decoded(tmp_path):

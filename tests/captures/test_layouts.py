@@ -109,9 +109,8 @@ def write_nerfstudio(folder: Path, cameras: list[pycolmap.Camera], names: list[s
     (folder / "transforms.json").write_text(json.dumps(everything))
     names = (*(f"float {axis}" for axis in "xyz"), "uint8 red", "uint8 green", "uint8 blue")
     header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property {name}\n" for name in names)
-    (folder / "sparse_pc.ply").write_text(
-        f"{header}end_header\n" + "".join(f"{x} {y} {z} 9 8 7\n" for x, y, z in POINTS)
-    )
+    rows = "".join(f"{x} {y} {z} 9 8 7\n" for x, y, z in POINTS)
+    (folder / "sparse_pc.ply").write_text(f"{header}end_header\n{rows}")
 
 
 @pytest.mark.parametrize("model", ["colmap/sparse/0", "colmap_sparse/0", "colmap_text", ""])

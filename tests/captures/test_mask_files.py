@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.captures import write_transforms
+from helpers.captures import write_capture, write_transforms
 from helpers.framework_runs import tiny_capture
 from helpers.refusals import assert_refused
 from PIL import Image
@@ -47,8 +47,7 @@ def stems_of(capture: Path) -> list[str]:
 def write_masks(capture: Path, names, mask: np.ndarray, folder: str = "masks", mode: str | None = None) -> None:
     (capture / folder).mkdir(exist_ok=True)
     for name in names:
-        image = Image.fromarray(mask)
-        (image.convert(mode) if mode else image).save(capture / folder / name)
+        Image.fromarray(mask).convert(mode).save(capture / folder / name)
 
 
 def assert_masked(views, expected: np.ndarray) -> None:
@@ -90,13 +89,16 @@ def test_masks_beside_photos_that_mean_one_or_the_other_are_said(capture, name):
     assert scene.train.masks is None and scene.notes[-1].startswith("8 masks or maps beside the photos are not")
 
 
-def test_photos_without_a_mask_are_whole(capture):
-    photos = photos_of(capture)
-    write_masks(capture, [f"{photos[3].stem}.png"], half_mask())
+def test_photos_without_a_mask_are_whole(tmp_path):
+    """A mask in another folder is none of theirs."""
+    capture = write_capture(tmp_path / "cup", nested=True)
+    for mask in (capture / "masks/left/0/photo04.png", capture / "masks/left/1/photo06.png"):
+        mask.parent.mkdir(parents=True)
+        Image.fromarray(half_mask()).save(mask)  # photo06 lies in left/0
     scene = load_scene(capture)
     assert scene.test.masks is None and [scene.train.mask(view) is None for view in range(7)].count(False) == 1
-    assert np.array_equal(scene.train.mask(2), half_mask() > 0)
-    assert scene.notes[-2].endswith("; 7 photos without one are whole")
+    assert np.array_equal(scene.train.mask(1), half_mask() > 0)
+    assert scene.notes[-2].endswith("; 8 photos without one are whole")
     assert scene.notes[-1] == "1 photos have masked pixels, 49.9% of them"
 
 
@@ -154,14 +156,13 @@ def test_reduced_copies_of_photos_take_full_or_reduced_masks(capture, folder):
     assert_masked(load_scene(capture, factor=2).train, expected > 0)
 
 
-def transforms_capture(tmp_path: Path, **of_first) -> Path:
+def transforms_capture(tmp_path: Path) -> Path:
     folder = write_transforms(tmp_path / "transforms", views=8)
     content = json.loads((folder / "transforms.json").read_text(encoding="utf-8-sig"))
     (folder / "of people").mkdir()
     for view, frame in enumerate(content["frames"]):
         frame["mask_path"] = f"of people/{view}-mask.png"
         Image.fromarray(half_mask((20, 10))).save(folder / frame["mask_path"])
-    content["frames"][1].update(of_first)
     (folder / "transforms.json").write_text(json.dumps(content))
     return folder
 

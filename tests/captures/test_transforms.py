@@ -56,12 +56,10 @@ def test_colors_of_points_are_scaled_by_their_type(kind, given, read):
     def vertices(values):
         return {name: np.array([value], kind) for name, value in zip(("red", "green", "blue"), values, strict=True)}
 
-    assert read_colors(Path("points.ply"), vertices(given)).tolist() == [read]
+    assert read_colors(Path("a.ply"), vertices(given)).tolist() == [read]
     if kind.startswith("float"):
         bad = vertices([0.5, math.nan, 0.5])
-        assert_refused(
-            r"points\.ply: the colours of 1 of 1 points are not finite", read_colors, Path("points.ply"), bad
-        )
+        assert_refused(r"a\.ply: the colours of 1 of 1 points are not finite", read_colors, Path("a.ply"), bad)
 
 
 def listed(*views: int) -> list[str]:
@@ -120,21 +118,18 @@ def test_damaged_poses_are_left_out_and_counted(tmp_path, value):
     edit(folder, set_poses(value, 3, 4))
     scene = load_scene(folder)
     assert scene.test.names == ("f5.png",) and scene.train.names == tuple(f"f{view}.png" for view in (0, 1, 2, 6, 7, 8))
-    assert scene.notes[1] == (
-        "2 of 9 images are left out as damaged: 'f3.png' has a pose that is not a finite rotation and translation"
-    )
+    said = "2 of 9 images are left out as damaged: 'f3.png' has a pose that is not a finite rotation and translation"
+    assert scene.notes[1] == said
 
 
 def write_cloud(path: Path, names=("red", "green", "blue"), end: str = "<", first: float = 1.0) -> None:
     """5 points at (i, 0, 0), but for the first one's x, of colours (i, 50, 100)."""
     rows = np.zeros(5, [(axis, f"{end}f4") for axis in "xyz"] + [(name, "u1") for name in names])
-    rows["x"] = np.arange(5)
-    rows["x"][0] = first
+    rows["x"] = first, 1, 2, 3, 4
     for name, values in zip(names, (np.arange(5), 50, 100), strict=False):
         rows[name] = values
-    types = "".join(f"property float {axis}\n" for axis in "xyz") + "".join(
-        f"property uchar {name}\n" for name in names
-    )
+    kinds = (*(f"float {axis}" for axis in "xyz"), *(f"uchar {name}" for name in names))
+    types = "".join(f"property {kind}\n" for kind in kinds)
     head = f"ply\nformat binary_{'little' if end == '<' else 'big'}_endian 1.0\nelement vertex 5\n{types}end_header\n"
     path.write_bytes(head.encode() + rows.tobytes())
 
@@ -197,10 +192,7 @@ def test_frames_to_test_on(tmp_path):
         (set_poses(None), "f0.png' is no matrix of 4x4 numbers"),
         (set_poses(np.diag([1, 1, -1, 1]).tolist()), "f0.png' is not a rotation"),
         (lambda content: content.update(test_frames=[{}]), "a frame without a file_path"),
-        (
-            lambda content: content.update(test_filenames=["images/f3.png", "g.png"]),
-            "test_filenames are no split: give",
-        ),
+        (lambda content: content.update(test_filenames=["images/f3.png", "g"]), "test_filenames are no split: give"),
         (lambda content: content.update(train_filenames=listed(*range(9))), "train_filenames.* are no split"),
         (lambda content: content.update(train_filenames=listed(1, 2, 3), test_filenames=listed(3, 4)), "are no split"),
         (lambda content: content.update(train_filenames=listed(1, 2), test_filenames=listed(3)), "2 training images"),

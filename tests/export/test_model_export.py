@@ -62,9 +62,7 @@ def test_a_capture_far_from_its_origin_is_exported_about_another(turbogs, finish
 
 
 @pytest.mark.parametrize(("name", "marked"), [("spz", True), ("ply", True), ("glb", False)])
-def test_a_file_says_that_its_model_is_antialiased_or_the_export_does(
-    turbogs, finished, capture, tmp_path, name, marked
-):
+def test_a_file_says_its_model_is_antialiased_or_the_export_does(turbogs, finished, capture, tmp_path, name, marked):
     model, file = load_model(finished, torch.device("cpu")), tmp_path / f"m.{name}"
     save_ply(model.gaussians, tmp_path / "a.ply", model.frame, antialiased=True)
     code, out, err = turbogs("export", tmp_path / "a.ply", "--scene", capture, "--format", name, "--out", file)

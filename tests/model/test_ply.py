@@ -85,10 +85,11 @@ def test_load_leaves_out_rows_that_are_not_finite_and_refuses_a_model_without_an
 
 
 def written(path: Path, columns: dict[str, np.ndarray], comment: str = "") -> Path:
-    """A .ply of float properties."""
+    """A .ply of float properties, with Windows' line ends and another element behind, as SHARP has."""
     head = ["ply", "format binary_little_endian 1.0", *([comment] if comment else [])]
-    head += [f"element vertex {len(columns['x'])}", *(f"property float {name}" for name in columns), "end_header\n"]
-    path.write_bytes("\n".join(head).encode() + np.stack(list(columns.values()), axis=1).astype("<f4").tobytes())
+    head += [f"element vertex {len(columns['x'])}", *(f"property float {name}" for name in columns)]
+    head += ["element extrinsic 2", "property float extrinsic", "end_header", ""]
+    path.write_bytes("\r\n".join(head).encode() + np.transpose([*columns.values()]).astype("<f4").tobytes() + bytes(8))
     return path
 
 
@@ -108,7 +109,7 @@ def test_infinite_opacities_and_flat_gaussians_stay(tmp_path, columns):
 
 def test_a_3d_filter_is_fused(tmp_path, columns):
     """Against covariances and integrals by hand."""
-    before = load_ply(written(tmp_path / "a.ply", columns))
+    before = load_ply(tmp_path / "own.ply")
     read = load_ply(written(tmp_path / "b.ply", columns | {"filter_3D": np.full(20, 0.5)}))
     variances = (2 * before.scales).exp()
     torch.testing.assert_close((2 * read.scales).exp(), variances + 0.25)
@@ -120,7 +121,7 @@ def test_a_3d_filter_is_fused(tmp_path, columns):
     ("comment", "antialiased"),
     [
         ("comment SplatRenderMode: mip", True),
-        ("comment splatrendermode:mip\r", True),
+        ("comment splatrendermode:mip", True),
         ("comment antialiased 1", True),
         ("comment antialiased 0", False),
         ("comment SplatRenderMode: default", False),
