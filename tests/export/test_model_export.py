@@ -22,7 +22,7 @@ from turbogs_plugin.train.saved_model import load_given, load_model, read_given
 from turbogs_plugin.types import SH_C0, WHITE
 
 FILES = list(EXPORTS)
-LOSSY = ("spz", "spz2")
+LOSSY = ("spz", "spz2", "splat")
 
 
 def refused(result: tuple[int, str, str], *words: object) -> None:

@@ -9,7 +9,7 @@ from helpers.models import random_gaussians
 
 from turbogs_plugin.engine.reference.projection import rotation_matrices
 from turbogs_plugin.engine.reference.spherical_harmonics import evaluate
-from turbogs_plugin.export.scene_files import save_glb, save_usda
+from turbogs_plugin.export.scene_files import save_glb, save_splat, save_usda
 from turbogs_plugin.scene import Frame
 from turbogs_plugin.types import Gaussians
 
@@ -59,6 +59,17 @@ def test_gltf(tmp_path, degree):
     quats = columns["ROTATION"][:, [3, 0, 1, 2]]
     assert_alike(made, columns["POSITION"], quats, columns["SCALE"], columns["OPACITY"][:, 0], harmonics)
     assert np.allclose(read.accessors[0].max, columns["POSITION"].max(axis=0)) and columns["COLOR_0"].max() <= 1
+
+
+def test_splat_by_hand(tmp_path):
+    """One Gaussian after a larger one, byte by byte."""
+    made = random_gaussians(2, 1)
+    made.means[1], made.scales[:], made.opacities[1] = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([[2.0], [0.0]]), 0.0
+    made.quats[1], made.sh0[1, 0] = torch.tensor([2.0, 0.0, -2.0, 0.0]), torch.tensor([0.0, 20.0, -20.0])
+    save_splat(made, tmp_path / "m.splat", Frame(np.zeros(3), 1.0))
+    content = (tmp_path / "m.splat").read_bytes()
+    assert len(content) == 64 and np.frombuffer(content, "<f4", 6, 32).tolist() == [1, 2, 3, 1, 1, 1]
+    assert list(content[56:]) == [128, 255, 0, 128, 219, 128, 37, 128]
 
 
 @pytest.mark.parametrize("degree", [0, 3])

@@ -149,8 +149,7 @@ def test_fused_step_is_the_twin_s(name, degree):
 
 
 @pytest.mark.parametrize(
-    ("name", "views"),
-    [("lm", 1), ("lm", 9), ("unscaled lm", 9), ("lm", 40), ("adam", 40), ("adam", 128), ("lm", 128)],
+    ("name", "views"), [("lm", 1), ("lm", 9), ("unscaled lm", 9), ("lm", 40), ("adam", 40), ("adam", 128), ("lm", 128)]
 )
 def test_fused_step_of_few_and_of_many_views(name, views):
     """More rows than a Gaussian has room for in shared memory, and more views than a mask has bits."""

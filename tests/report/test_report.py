@@ -49,8 +49,7 @@ def test_a_strip_is_photo_render_and_error():
 
 
 def test_a_strip_says_what_its_pictures_are():
-    white = np.full((5, 3 * 200 + 2 * GAP, 3), 255, np.uint8)
-    made = titled(white)
+    made = titled(white := np.full((5, 3 * 200 + 2 * GAP, 3), 255, np.uint8))
     assert made.shape == (TITLE + 5, *white.shape[1:]) and (made[TITLE:] == 255).all()
     assert all((made[:TITLE, left : left + 60] < 128).any() for left in (0, 200 + GAP, 2 * (200 + GAP)))
     scale = made[TITLE // 2, 2 * (200 + GAP) + 64 :][:64].astype(int)

@@ -68,8 +68,7 @@ def ours(gaussians, batch, step: Step, config: dict, opacity_reset: str) -> RowU
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
-    ("config", "iteration"),
-    [({}, 600), ({}, 3100), ({}, 3000), ({"refine_start_iter": 30, "refine_every": 40}, 80)],
+    ("config", "iteration"), [({}, 600), ({}, 3100), ({}, 3000), ({"refine_start_iter": 30, "refine_every": 40}, 80)]
 )
 @pytest.mark.parametrize("opacity_reset", ["repaired", "as_shipped"])
 def test_equals_gsplat(seed, config, iteration, opacity_reset):

@@ -82,7 +82,7 @@ def render(
         size: of the film, e.g. 1920x1080; a photo's, or the file's, where absent.
         device: where to render.
     """
-    from turbogs_plugin.export.renders import FilmShape, film_run, render_run
+    from turbogs_plugin.export.renders import film_run, render_run
 
     settings = given.settings(overrides)
     if path is None:
@@ -93,8 +93,7 @@ def render(
     else:
         if depth or split != "test" or out is None:
             raise InputError("--path writes a film: it takes --out FILE.mp4, not --split or --depth")
-        shape = FilmShape(10.0 if seconds is None else seconds, 60.0 if fps is None else fps, size)
-        print(f"film   {film_run(run, path, out, shape, device, settings)}")
+        print(f"film   {film_run(run, path, out, device, settings, seconds, fps, size)}")
     return 0
 
 
@@ -103,7 +102,7 @@ def export(
     overrides: Overrides = (),
     /,
     *,
-    format: Annotated[str, arg(metavar="ply|pt|spz|spz2|glb|usda|html")] = "ply",
+    format: Annotated[str, arg(metavar="ply|pt|spz|spz2|splat|glb|usda|html")] = "ply",
     out: Path | None = None,
     max_gaussians: Count = None,
     cameras: FlagCreatePairsOff[bool] = False,
@@ -117,8 +116,8 @@ def export(
         overrides: with --scene, as in eval.
         format: ply: as the original 3DGS writes it, which viewers read. pt: a checkpoint of gsplat's simple_trainer,
             which needs --no-normalize-world-space to take it. spz: smaller, with some loss; spz2: its older version;
-            glb: glTF with KHR_gaussian_splatting. usda: OpenUSD's ParticleField3DGaussianSplat. html: a page with the
-            model to turn in a browser, without a network.
+            splat: one colour each. glb: glTF with KHR_gaussian_splatting. usda: OpenUSD's
+            ParticleField3DGaussianSplat. html: a page with the model to turn in a browser, without a network.
         out: new file; export.ply, model.pt, ..., or model.html in the run's folder where absent.
         max_gaussians: largest number of Gaussians; those are kept that add most to the training views.
         cameras: give each photo of a capture a refined camera of its own, and write a capture to train on, with

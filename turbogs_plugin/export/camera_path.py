@@ -24,10 +24,8 @@ MOST_KEYS = 24
 """Largest number of a capture's cameras that a path goes through, evenly spread: more would make it jitter."""
 SWING = math.pi
 """Largest gap in radians between cameras that surround what they look at; beyond it an orbit swings."""
-WIDEST_FILM = 1920
-"""Pixels of the longer side of a film from the capture's cameras; a file's cameras have their own size."""
-LARGEST_FILM = 4096
-"""Pixels of a side of any film: an image of 8192 x 8192 would take minutes and gigabytes."""
+WIDEST_FILM, LARGEST_FILM = 1920, 4096
+"""Pixels of the longer side of a film from the capture's cameras, and of any film: more takes minutes and gigabytes."""
 
 
 def orbit(cameras: Cameras, frames: int) -> Cameras:

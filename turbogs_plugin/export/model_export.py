@@ -19,7 +19,7 @@ from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.html_page import html_page, page_gaussians
-from turbogs_plugin.export.scene_files import save_glb, save_usda
+from turbogs_plugin.export.scene_files import read_splat, save_glb, save_splat, save_usda
 from turbogs_plugin.files import require_new_file, write_text_atomically
 from turbogs_plugin.model.formats import FORMATS, Read, Write
 from turbogs_plugin.model.similarity import Similarity, local_origin
@@ -37,6 +37,7 @@ PAGE = "html"
 EXPORTS: dict[str, tuple[Write, Read | None]] = {
     **FORMATS,
     "spz2": (partial(save_spz, version=2), read_spz),
+    "splat": (save_splat, read_splat),
     "glb": (save_glb, None),
     "usda": (save_usda, None),
 }

@@ -8,7 +8,6 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -79,34 +78,26 @@ def distinct_stems(names: Sequence[str]) -> list[str]:
     return list(stems)
 
 
-@dataclass(frozen=True)
-class FilmShape:
-    """Length in seconds, frames a second, and ``WIDTHxHEIGHT`` in pixels; None: as its path's cameras have it. Raises
-    `InputError` where one of them is none."""
-
-    seconds: float = 10.0
-    fps: float = 60.0
-    size: str | None = None
-
-    def __post_init__(self) -> None:
-        for name, value, most in (("seconds", self.seconds, 3600), ("fps", self.fps, 240)):
-            if not 0 < value <= most:
-                raise InputError(f"--{name} {value:g}: it must be more than 0 and at most {most}")
-        if self.size is not None and (
-            len(self.pixels) != 2 or not all(2 <= side <= LARGEST_FILM for side in self.pixels)
-        ):
-            raise InputError(f"--size '{self.size}': write WIDTHxHEIGHT in pixels, as 1920x1080, at most 4096")
-
-    @property
-    def pixels(self) -> list[int]:
-        return [int(side) for side in (self.size or "").split("x") if side.isdecimal()]
-
-
 def film_run(
-    path: Path, camera_path: str, video: Path, shape: FilmShape, device_name: str, given: Config | None = None
+    path: Path,
+    camera_path: str,
+    video: Path,
+    device_name: str,
+    given: Config | None = None,
+    seconds: float | None = None,
+    fps: float | None = None,
+    size: str | None = None,
 ) -> Path:
-    """Write a film of the model of `open_saved` into a new file, along orbit, views, or a file of cameras. Errors as of
+    """Write a film of the model of `open_saved` into a new file, along orbit, views, or a file of cameras: 10 `seconds`
+    where absent, 60 frames a second, and the `size` (``WIDTHxHEIGHT``) that the path's cameras have. Errors as of
     `open_saved`; `InputError`, too, where an option does not fit."""
+    seconds, fps = 10.0 if seconds is None else seconds, 60.0 if fps is None else fps
+    for name, value, most in (("seconds", seconds, 3600), ("fps", fps, 240)):
+        if not 0 < value <= most:
+            raise InputError(f"--{name} {value:g}: it must be more than 0 and at most {most}")
+    sides = [int(side) for side in (size or "").split("x") if side.isdecimal()]
+    if size is not None and (len(sides) != 2 or not all(2 <= side <= LARGEST_FILM for side in sides)):
+        raise InputError(f"--size '{size}': write WIDTHxHEIGHT in pixels, as 1920x1080, at most {LARGEST_FILM}")
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise InputError(f"a film needs imageio-ffmpeg: {INSTALL}")
     if camera_path not in PATHS and not Path(camera_path).is_file():
@@ -116,11 +107,11 @@ def film_run(
     require_new_file(video, "--out")
     require_writable(video.parent, f"--out '{video}'")
     model, scene = open_saved(path, device_name, given)
-    frames = max(1, round(shape.fps * shape.seconds))
+    frames = max(1, round(fps * seconds))
     along = PATHS.get(camera_path)
     cameras = along(scene.train.cameras, frames) if along else from_file(Path(camera_path), scene, frames)
-    cameras = resized(cameras, *shape.pixels) if shape.size else cameras
-    write_film(model.gaussians, model.own_look(scene.train), cameras, video, shape.fps)
+    cameras = resized(cameras, *sides) if sides else cameras
+    write_film(model.gaussians, model.own_look(scene.train), cameras, video, fps)
     return video
 
 

@@ -1,5 +1,9 @@
-"""Models for scenes, by `formats.Write`: glTF with KHR_gaussian_splatting, and OpenUSD's ParticleField3DGaussianSplat
-(of version 26.03). Both have all numbers in float32, as trained; axes are x right, y up, z backward."""
+"""Models for scenes and for the web, by `formats.Write`: glTF with KHR_gaussian_splatting, OpenUSD's
+ParticleField3DGaussianSplat (of version 26.03), and antimatter15's ``.splat``.
+
+glTF and OpenUSD have all numbers in float32, as trained; axes are x right, y up, z backward. A ``.splat`` has 32 bytes
+a Gaussian, one colour each, the most visible first, in the capture's own axes.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ import math
 import struct
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -25,6 +30,7 @@ FLOAT, VERTICES, POINTS, TYPES = 5126, 34962, 0, {1: "SCALAR", 3: "VEC3", 4: "VE
 LARGEST_GLB = 2**32 - 1
 ROWS_AT_ONCE = 10_000
 """Rows of numbers that become text at a time."""
+SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 
 
 def save_glb(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, antialiased: bool = False) -> None:
@@ -108,3 +114,28 @@ def _tuples(values: Tensor) -> str:
     return ", ".join(
         ", ".join([item] * len(part)) % tuple(part.flatten().tolist()) for part in values.split(ROWS_AT_ONCE)
     )
+
+
+def save_splat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, antialiased: bool = False) -> None:
+    """Write a ``.splat``, without the higher bands."""
+    model = in_capture(gaussians, frame, path)
+    opacities = torch.sigmoid(model.opacities)
+    table = np.zeros(len(model), SPLAT)
+    table["means"], table["scales"] = model.means.numpy(), model.scales.exp().numpy()
+    table["colors"] = _bytes(torch.cat([SH_C0 * model.sh0[:, 0] + 0.5, opacities[:, None]], dim=1) * 255.0)
+    table["quats"] = _bytes(normalize(model.quats, dim=1) * 128.0 + 128.0)
+    order = torch.argsort(model.scales.sum(dim=1) + opacities.log(), descending=True, stable=True)
+    write_atomically(path, lambda file: file.write(table[order.numpy()].tobytes()))
+
+
+def read_splat(path: Path) -> tuple[Gaussians, bool]:
+    """What `save_splat` wrote (`formats.Read`), on the CPU."""
+    table = np.fromfile(path, SPLAT)
+    means, scales, colors, quats = (torch.from_numpy(table[name].astype(np.float64)) for name in SPLAT.names or ())
+    sh0 = (colors[:, None, :3] / 255.0 - 0.5) / SH_C0
+    opacities = torch.logit((colors[:, 3] / 255.0).clamp(1e-4, 0.9999))
+    return Gaussians(means, quats - 128.0, scales.log(), opacities, sh0, means.new_zeros(len(means), 0, 3)), False
+
+
+def _bytes(values: Tensor) -> np.ndarray:
+    return values.round().clamp(0, 255).to(torch.uint8).numpy()

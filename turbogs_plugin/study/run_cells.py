@@ -87,7 +87,7 @@ def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | Non
     study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
     _require_same_settings(study, configs)
     folder.write_study(Study(ablation, study.results))
-    device = _device(configs)
+    device = torch.device(next(iter(configs.values())).train.device)
     if gpus is not None and device.type != "cpu" and gpus > torch.cuda.device_count():
         raise InputError(f"--gpus {gpus}: this machine has {torch.cuda.device_count()}; see 'turbogs doctor'")
     here = provenance(device.type)
@@ -104,7 +104,7 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
     """Train, in this process, the cells that the folder has not and no other process trains; what broke. Raises
     `InputError` where a capture cannot be read, or is another one than the finished cells'."""
     configs = choice.configs(ablation)
-    device = _device(configs)
+    device = torch.device(next(iter(configs.values())).train.device)
     warm: set[tuple[str, str]] = set()  # variants and captures
     broken: list[str] = []
     for number, (key, config) in enumerate(configs.items(), 1):
@@ -130,11 +130,6 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
             # One write with the end of the line, or the lines of two processes would stand on one.
             print(f"[{number}/{len(configs)}] {said}\n", end="", file=sys.stderr, flush=True)
     return broken
-
-
-def _device(configs: dict[CellKey, Config]) -> torch.device:
-    """Of all cells: overrides say it, or auto."""
-    return torch.device(next(iter(configs.values())).train.device)
 
 
 @lru_cache(maxsize=2)  # with refined cameras and without
