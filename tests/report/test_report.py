@@ -52,7 +52,7 @@ def test_a_strip_says_what_its_pictures_are():
     made = titled(white := np.full((5, 3 * 200 + 2 * GAP, 3), 255, np.uint8))
     assert made.shape == (TITLE + 5, *white.shape[1:]) and (made[TITLE:] == 255).all()
     assert all((made[:TITLE, left : left + 60] < 128).any() for left in (0, 200 + GAP, 2 * (200 + GAP)))
-    scale = made[TITLE // 2, 2 * (200 + GAP) + 64 :][:64].astype(int)
+    scale = made[TITLE // 2, 2 * (200 + GAP) + 60 :][:48].astype(int)
     assert (np.diff(scale.sum(axis=1)) >= 0).all() and scale[0].max() < 16 and scale[-1].min() > 150
 
 

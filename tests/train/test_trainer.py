@@ -29,7 +29,7 @@ from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.strategies.density.rows import NoDensity
 from turbogs_plugin.strategies.losses import CharbonnierLoss
-from turbogs_plugin.strategies.protocols import PixelSampler, SparseLoss
+from turbogs_plugin.strategies.protocols import SparseLoss
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import read_history
@@ -314,9 +314,8 @@ def test_more_views_an_iteration_than_a_gpu_takes_are_refused_before_anything_is
         run.new_loop(config, SimpleNamespace(train=range(150)), torch.device("cuda"))
 
 
-class OwnSampler(PixelSampler):
-    def sample(self, maps, view_ids, rate, step):
-        return PixelSamples.from_mask(torch.ones(len(view_ids), 24, 40, dtype=torch.bool))  # of which views?
+def own_sampler(*size, named=True):
+    return SimpleNamespace(sample=lambda _, ids, *__: PixelSamples.from_mask(torch.ones(4, *size) > 0, *[ids] * named))
 
 
 class OwnLoss(SparseLoss):
@@ -329,15 +328,16 @@ class OwnLoss(SparseLoss):
 @pytest.mark.parametrize(
     ("part", "strategy", "message"),
     [
-        ("pixel_sampler", OwnSampler, r"returned samples of views \(0, .*, asked for .*give view_ids to PixelSamples"),
-        ("loss", OwnLoss, r"returned pixel_errors of shape \(\d+, 3\), not \(\d+,\)"),
+        ("pixel_sampler", own_sampler(24, 40, named=False), r"view_ids \[0, .*, not .*give view_ids, and masks"),
+        ("pixel_sampler", own_sampler(40, 24), r"sizes \[\[24, 40\].*, not \[\[40, 24\].*masks \[K, H, W\]"),
+        ("loss", OwnLoss(), r"returned pixel_errors of shape \(\d+, 3\), not \(\d+,\)"),
     ],
 )
 def test_what_a_strategy_of_ones_own_returns_is_refused_and_nothing_is_left(
     capture, tmp_path, monkeypatch, part, strategy, message
 ):
     built = Config.build
-    monkeypatch.setattr(Config, "build", lambda self, kind: strategy() if kind == part else built(self, kind))
+    monkeypatch.setattr(Config, "build", lambda self, kind: strategy if kind == part else built(self, kind))
     with pytest.raises(InputError, match=message):
         run.train(tiny_config(capture, "schedule.min_views=3", "view_sampler.type=random"), tmp_path / "run")
     assert not (tmp_path / "run").exists()

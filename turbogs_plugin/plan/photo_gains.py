@@ -165,9 +165,8 @@ def _patches(views: PosedImages, points: Tensor) -> list[_Patches]:
         places = np.stack([flat % width, flat // width], axis=1)[:, None] + turned  # [n, 25, 2]
         whole = ((places >= 0) & (places < (width, height))).all(axis=(1, 2))
         pixels = torch.from_numpy(int(offsets[view]) + places[whole] @ np.array([1, width]))
-        rows = stored.index_select(0, pixels.flatten().to(stored.device)).view(*pixels.shape, stored.shape[1])
-        colors = rows[..., :3].cpu().numpy() / np.float32(255.0)
-        patches.append(_comparable(shown.numpy()[whole], colors))
+        colors = stored.index_select(0, pixels.flatten().to(stored.device)).view(*pixels.shape, stored.shape[1])
+        patches.append(_comparable(shown.numpy()[whole], colors[..., :3].cpu().numpy() / np.float32(255.0)))
     return patches
 
 

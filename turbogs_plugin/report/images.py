@@ -52,11 +52,10 @@ def titled(pixels: np.ndarray) -> np.ndarray:
     the error the scale of its colours."""
     bar = Image.new("RGB", (pixels.shape[1], TITLE), "white")
     draw, font, step = ImageDraw.Draw(bar), ImageFont.load_default(size=15), (pixels.shape[1] + GAP) // 3
-    for place, name in enumerate(("photo", "render", "error 0")):
-        draw.text((place * step + 4, 2), name, fill="black", font=font)
-    scale = colored(torch.linspace(0.0, 1.0, 64).expand(TITLE - 10, 64)).numpy()
-    bar.paste(Image.fromarray(scale), (2 * step + 64, 6))
-    draw.text((2 * step + 134, 2), f"{ERROR_FULL_SCALE} and more", fill="black", font=font)
+    for left, name in ((0, "photo"), (step, "render"), (2 * step, "error 0"), (2 * step + 108, f"{ERROR_FULL_SCALE}")):
+        draw.text((left + 4, 2), name, fill="black", font=font)
+    scale = colored(torch.linspace(0.0, 1.0, 48).expand(TITLE - 10, 48)).numpy()
+    bar.paste(Image.fromarray(scale), (2 * step + 60, 6))
     return np.concatenate((np.asarray(bar), pixels))
 
 

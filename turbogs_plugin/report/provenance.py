@@ -80,11 +80,8 @@ def missing_bytecode() -> str:
     """A remedy where Python compiles all of torch each time that a command begins; empty where it does not."""
     if Path(importlib.util.cache_from_source(torch.__file__)).is_file():
         return ""
-    packages = shlex.quote(str(Path(torch.__file__).parents[1]))
-    return (
-        "bytecode of torch: every command compiles it anew, for seconds; make it once by  "
-        f"{shlex.quote(sys.executable)} -m compileall -q -j 0 {packages}"
-    )
+    command = f"{shlex.quote(sys.executable)} -m compileall -q -j 0 {shlex.quote(str(Path(torch.__file__).parents[1]))}"
+    return f"bytecode of torch: every command compiles it anew, for seconds; make it once by  {command}"
 
 
 def source_commit() -> str:

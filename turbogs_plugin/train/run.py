@@ -15,6 +15,7 @@ from turbogs_plugin.captures.bundle_adjustment import refine_cameras
 from turbogs_plugin.captures.load import holds_photos_alone
 from turbogs_plugin.config.components import KINDS, completed
 from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, resolve
+from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.device import free_bytes
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine.layout import MAX_VIEWS
@@ -113,6 +114,7 @@ def fit(
     scene: Scene | Path | str,
     *overrides: str,
     config: str | Path | Mapping[str, Any] = DEFAULT_CONFIG,
+    iterations: int | None = None,
     callback: Callable[[Evaluation], object] | None = None,
     progress: bool = False,
     **strategies: Unpack[Strategies],
@@ -124,6 +126,7 @@ def fit(
             configuration says how to read.
         overrides: changes of the configuration, ``section.key=value``, as ``"train.iterations=500"``.
         config: name of a packaged configuration, a YAML file, or a mapping like that of a YAML.
+        iterations: in the place of `train.iterations`, with all that counts them.
         callback: called with each evaluation (`train.evaluate_at`).
         progress: show a line for each evaluation on stderr, and on a terminal the seconds left.
         strategies: objects in the place of those that the configuration names, by kind: ``pixel_sampler=MySampler()``.
@@ -132,10 +135,13 @@ def fit(
         InputError: anything wrong with the input.
         TrainingStopped: the training cannot go on.
     """
-    for kind in strategies:
+    for kind, strategy in strategies.items():
         if kind not in KINDS:
             raise InputError(f"fit: unknown kind of strategy '{kind}': {nearest(kind, KINDS)}")
+        if isinstance(strategy, type):
+            raise InputError(f"fit: {kind}={strategy.__name__} is a class: give an object, {strategy.__name__}(...)")
     settings = load_config(config if isinstance(config, Mapping) else str(config), overrides)
+    settings = settings if iterations is None else with_iterations(settings, iterations)
     device, refine = resolve_device(settings.train.device), settings.train.refine_cameras
     if isinstance(scene, Scene):
         scene = refine_cameras(scene, refine)

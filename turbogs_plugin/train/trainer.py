@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -46,7 +47,7 @@ class Trainer(TrainingState):
 
         # 3) Pixel sampling
         samples = self.pixel_sampler.sample(self.maps, view_ids, budget.rate, step)
-        require_samples(samples, view_ids, self.pixel_sampler)
+        require_samples(samples, view_ids, self.maps.sizes[list(view_ids)], self.pixel_sampler)
         if self.maps.masks is not None and not self.pixel_sampler.heeds_masks:
             samples = self.maps.masks.strip(samples)
         if self.on_samples is not None:
@@ -150,13 +151,13 @@ def require_type(value: object, kind: type, strategy: object) -> None:
         raise InputError(f"{type(strategy).__name__} returned {type(value).__name__}, not {kind.__name__}")
 
 
-def require_samples(samples: PixelSamples, view_ids: Sequence[int], sampler: PixelSampler) -> None:
-    """Raise `InputError` unless `samples` are of these views, in this order, whose renders are compared with their
-    photos and error maps."""
+def require_samples(samples: PixelSamples, view_ids: Sequence[int], sizes: np.ndarray, sampler: PixelSampler) -> None:
+    """Raise `InputError` unless `samples` are of these views in this order, and of their `sizes` [K, 2]."""
     require_type(samples, PixelSamples, sampler)
-    if samples.view_ids != tuple(view_ids):
-        said = f"{type(sampler).__name__} returned samples of views {samples.view_ids}, asked for {tuple(view_ids)}"
-        raise InputError(f"{said}: give view_ids to PixelSamples, or to from_mask")
+    for what, found, wanted in (("view_ids", samples.view_ids, view_ids), ("sizes", samples.sizes, sizes)):
+        if not np.array_equal(found, wanted):
+            said = f"returned samples with {what} {np.array(found).tolist()}, not {np.array(wanted).tolist()}"
+            raise InputError(f"{type(sampler).__name__} {said}: give view_ids, and masks [K, H, W], to from_mask")
 
 
 def require_rows(update: RowUpdate, controller: DensityController) -> None:
