@@ -382,11 +382,13 @@ def test_a_folder_is_read_as_the_section_scene_says(capture):
 def test_fit_takes_a_mapping_and_a_callback_and_names_what_it_does_not_know(capture):
     seen: list = []
     settings = {"train": {"iterations": 2, "refine_until": 1, "device": "cpu"}}
-    result = fit(capture, config=settings, callback=seen.append)
-    assert seen == result.history and result.config.train.iterations == 2
+    result = fit(capture, config=settings, iterations=4, callback=seen.append)
+    assert seen == result.history and (result.config.train.iterations, result.config.train.refine_until) == (4, 2)
     assert re.fullmatch(r"Fit of Scene 'capture': 7 .* points: .* on cpu, \d+\.\d\d dB after \d\.\d s", repr(result))
     with pytest.raises(InputError, match="unknown kind of strategy 'sampler': did you mean"):
         fit(capture, sampler=None)
+    with pytest.raises(InputError, match=r"loss=CharbonnierLoss is a class: give an object, CharbonnierLoss\(\.\.\.\)"):
+        fit(capture, loss=CharbonnierLoss)
     with pytest.raises(InputError, match="fit: object is no PixelSampler: it lacks sample"):
         fit(capture, config=settings, pixel_sampler=object())
     with pytest.raises(InputError, match=r"loss: depths are read for the setting loss\.depth_weight alone"):
