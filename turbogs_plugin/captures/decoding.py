@@ -40,7 +40,7 @@ FORMATS = ("JPEG", "PNG", "TIFF", "BMP")
 """Formats of images, told by content. Pillow would try dozens, PostScript among them, for which it starts a program."""
 OTHER_FORMATS = {".webp": "WEBP", ".avif": "AVIF", ".jp2": "JPEG2000"}
 """Suffix -> the format that files of it may have besides."""
-PIXELS_A_BYTE, ALWAYS_PIXELS = 128, 1 << 25
+PIXELS_A_BYTE, ALWAYS_PIXELS = 96, 1 << 25
 """Most pixels of an image for each byte of its file, and pixels that any file may have: files of a few kilobytes can
 unpack to gigabytes. A photo has 1 to 20 pixels a byte, an even grey one of JPEG 64."""
 MOST_SCANS = 200  # of a progressive JPEG, each of which goes over all pixels; programs write about ten
