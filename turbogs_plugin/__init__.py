@@ -37,13 +37,12 @@ def lazy_face(package: str, places: Mapping[str, str]) -> tuple[Callable[[str], 
 
 
 _PLACES = {
-    "Fit": "turbogs_plugin.train.run",
-    "fit": "turbogs_plugin.train.run",
+    **dict.fromkeys(("Fit", "fit"), "turbogs_plugin.train.run"),
     "load_scene": "turbogs_plugin.captures",
-    "rasterize": "turbogs_plugin.engine.render",
-    "render_image": "turbogs_plugin.engine.render",
+    **dict.fromkeys(("rasterize", "render_image"), "turbogs_plugin.engine.render"),
     "orbit": "turbogs_plugin.export.camera_path",
 }
 
 __all__ = ["__version__", *_PLACES]
-__getattr__, __dir__ = lazy_face(__name__, _PLACES)
+if not TYPE_CHECKING:  # or a checker takes any name for there
+    __getattr__, __dir__ = lazy_face(__name__, _PLACES)

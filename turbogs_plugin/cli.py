@@ -39,8 +39,7 @@ def _run(words: list[str]) -> int:
     except (ImportError, AttributeError) as error:
         from turbogs_plugin.doctor import INSTALL_COMMANDS, diagnosis, lacking_packages
 
-        lacking = lacking_packages()
-        if not lacking:
+        if not (lacking := lacking_packages()):
             raise
         if words == ["doctor"]:  # which needs no package of the extra, but for the parser of its name
             print(diagnosis())

@@ -40,7 +40,7 @@ def test_pictures_and_views_are_chosen_on_the_page_and_moving_frames_are_jpeg(sh
         client.look(camera)
         client.next_frame(lossless=True)
         for picture, view in ((Picture.COMPARE, 2), (Picture.ERRORS, 4), (Picture.RENDER, 4)):
-            client.press(page._slider._impl.uuid, view)
+            client.press(page._slider._impl.uuid, view + 1)
             client.press(page._pictures._impl.uuid, picture.value)
             expected, _ = draw(state, picture, camera, view)
             came = (client.next_frame(lossless=True).pixels() for _ in range(5))  # perhaps after the choice of a view

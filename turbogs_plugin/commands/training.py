@@ -56,8 +56,7 @@ def train(
         raise InputError("--viewer-host says where a viewer listens: give --viewer, too")
     if resume is not None:
         if scene or overrides or out or options != NO_OPTIONS:
-            others = "--no-report, --viewer, --gpus and --trust"
-            raise InputError(f"--resume goes on by the run's own configuration: give it nothing else but {others}")
+            raise InputError("--resume takes the run's configuration: add only --no-report, --viewer, --gpus, --trust")
     elif trust:
         raise InputError("--trust is for --resume: a configuration that you name yourself is your own word")
     if (target := resume or out) is None or (scene or resume) is None:
@@ -154,7 +153,9 @@ def _tell(session: RunSession, reported: bool) -> int:
     """Print how a training call ended, and give its exit code."""
     folder = session.folder
     if session.signal is not None:
-        print(f"stopped and saved: go on with  turbogs train --resume {shlex.quote(str(folder.path))}", file=sys.stderr)
+        own = any(":" in str(section.get("type")) for section in session.trainer.config.to_mapping().values())
+        words = f"--resume {shlex.quote(str(folder.path))}{' --trust' if own else ''}"
+        print(f"stopped and saved: go on with  turbogs train {words}", file=sys.stderr)
         return 128 + session.signal
     print(session.wall.text())
     if reported:

@@ -75,8 +75,7 @@ def load_lpips(device: torch.device) -> tuple[ImageError | None, str]:
     weights = Path(torch.hub.get_dir()) / "checkpoints" / "vgg16-397923af.pth"  # torchvision's name
     if not weights.is_file():
         # Without the folder's path: studies keep the reason in their records, which others read.
-        remedy = f"put torchvision's {weights.name} into torch's hub/checkpoints"
-        return None, f"there are no weights of VGG16 here: {remedy}"
+        return None, f"there are no weights of VGG16: put torchvision's {weights.name} into torch's hub/checkpoints"
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     network = LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True).to(device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -28,11 +28,11 @@ class PosedImages:
     """
 
     cameras: Cameras
-    names: tuple[str, ...]
-    photos: Photos
-    masks: PixelMasks | None = None
-    observations: Observations | None = None
-    refined: Cameras | None = None
+    names: tuple[str, ...] = field(repr=False)
+    photos: Photos = field(repr=False)
+    masks: PixelMasks | None = field(default=None, repr=False)
+    observations: Observations | None = field(default=None, repr=False)
+    refined: Cameras | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         return len(self.names)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,12 @@ class FurtherErrors:
     learn exposures, where plain ones are of views with the exposures of their neighbours (`interpolated_exposures`).
     `refined`: by refined cameras of the test photos (`PosedImages.refined`), at the end."""
 
-    own_psnr: float = math.nan
-    own_ssim: float = math.nan
-    own_l1: float = math.nan
-    refined_psnr: float = math.nan
-    refined_ssim: float = math.nan
-    refined_l1: float = math.nan
+    own_psnr: float = field(default=math.nan, repr=False)
+    own_ssim: float = field(default=math.nan, repr=False)
+    own_l1: float = field(default=math.nan, repr=False)
+    refined_psnr: float = field(default=math.nan, repr=False)
+    refined_ssim: float = field(default=math.nan, repr=False)
+    refined_l1: float = field(default=math.nan, repr=False)
 
     def further(self) -> dict[str, float]:
         """These errors alone, by name."""

@@ -33,6 +33,9 @@ class Cameras:
         self._rows: tuple[int, ...] | None = None
         self._viewmats, self._Ks = viewmats, Ks
 
+    def __repr__(self) -> str:
+        return f"{len(self)} cameras of {' or '.join(f'{w}x{h}' for w, h in np.unique(self.sizes, axis=0)[:3])}"
+
     def __len__(self) -> int:
         return self._viewmats.shape[0] if self._rows is None else len(self._rows)
 

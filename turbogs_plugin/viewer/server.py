@@ -86,15 +86,14 @@ class Page:
         self.url = f"http://{host}:{self.server.get_port()}"
         gui: Any = self.server.gui  # its handles' values cannot be set, says its type
         self._status = gui.add_markdown("Photos are being read, and error maps made.")
-        names = [picture.value for picture in Picture]
-        self._pictures = gui.add_dropdown("Picture", names, initial_value=names[0])
-        self._slider = gui.add_slider("View", 0, 1, 1, 0, visible=False)
+        self._pictures = gui.add_dropdown("Picture", [picture.value for picture in Picture])
+        self._slider = gui.add_slider("View", 1, 2, 1, 1, visible=False)  # from 1, as the line about a view counts
         self._there = gui.add_button("Stand at this view", visible=False)
         self.training = gui.add_folder("Training", visible=training)
         with self.training:
             self._pause = gui.add_button("Pause")
             self._step = gui.add_button("One step")
-        self._there.on_click(lambda _: self.go_to(self._slider.value))
+        self._there.on_click(lambda _: self.go_to(self._slider.value - 1))
         self._pause.on_click(self._pause_clicked)
         self._step.on_click(self._step_clicked)
         self.pause(False)
@@ -107,7 +106,7 @@ class Page:
     def wish(self) -> tuple[Picture, int]:
         """The picture and the view that the pages show; a picture that a client made up is the render."""
         name = self._pictures.value
-        return Picture(name) if name in list(Picture) else Picture.RENDER, self._slider.value
+        return Picture(name) if name in list(Picture) else Picture.RENDER, self._slider.value - 1
 
     def pause(self, paused: bool) -> None:
         """Let the training wait, or go on; iterations that it was asked for are void."""
@@ -119,7 +118,7 @@ class Page:
         self.capture = capture
         cameras = capture.train.cameras
         self.server.scene.set_up_direction(focus_and_up(cameras)[1])
-        self._slider.max = max(1, len(capture) - 1)
+        self._slider.max = max(2, len(capture))
         self._slider.visible = self._there.visible = True
         self.stand_at(ViewerCamera.of_view(cameras, 0))
 
@@ -143,8 +142,8 @@ class Page:
     def go_to(self, number: int) -> None:
         """Choose a view, and bring every client's camera there."""
         if self.capture is not None:
-            self._slider.value = number = min(max(0, number), len(self.capture) - 1)
-            views, view_id = self.capture.find(number)
+            self._slider.value = 1 + min(max(0, number), len(self.capture) - 1)
+            views, view_id = self.capture.find(self._slider.value - 1)
             self.stand_at(ViewerCamera.of_view(views.cameras, view_id))
 
     def close(self) -> None:
