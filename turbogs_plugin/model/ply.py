@@ -20,6 +20,7 @@ from turbogs_plugin.types import Gaussians
 POSITION_ERROR = 1e-6
 """Largest `rounding` of positions that are written as float."""
 OWN = Frame(np.zeros(3), 1.0)  # the frame that is the capture's own coordinates
+FEWEST_TOLD = 100  # Gaussians; of so many, no trained model has every scale above e^0 and every logit in [0, 1]
 HEADER_AT_MOST = 1 << 16  # bytes of a file in which a comment is looked for
 ANTIALIASED = re.compile(rb"^comment\s+(splatrendermode:\s*mip|antialiased\W+(1|true))\b", re.MULTILINE | re.IGNORECASE)
 """Brush's comment, which splat-transform writes, too, and Postshot's."""
@@ -65,20 +66,19 @@ def read_ply(path: Path) -> tuple[Gaussians, bool]:
     names = [name for group in groups.values() for name in group]
     missing = [name for name in names if name not in vertices]
     if missing == ["scale_2"]:
-        raise InputError(
-            f"{path} lacks scale_2: it is a model of 2D Gaussian Splatting, whose disks are drawn otherwise: train the "
-            "capture anew as 3DGS, or draw it with the program that trained it"
-        )
+        remedy = "train the capture anew as 3DGS, or draw it with the program that trained it"
+        kind = "a model of 2D Gaussian Splatting, whose disks are drawn otherwise"
+        raise InputError(f"{path} lacks scale_2: it is {kind}: {remedy}")
     if missing:
-        raise InputError(
-            f"{path} is not a 3DGS model: it lacks the properties {', '.join(missing[:4])}, as a mesh or a cloud of "
-            "points does: give the .ply that a 3DGS trainer exports"
-        )
+        lacks = f"it lacks the properties {', '.join(missing[:4])}, as a mesh or a cloud of points does"
+        raise InputError(f"{path} is not a 3DGS model: {lacks}: give the .ply that a 3DGS trainer exports")
     if not (count := len(vertices["x"])):
         raise InputError(f"{path} holds no Gaussians: export the model again")
     table = torch.from_numpy(np.stack([vertices[name] for name in names], axis=1, dtype=np.float64))  # [N, D]
     means, sh0, shN, opacities, scales, quats = table.split([len(group) for group in groups.values()], dim=1)
     opacities = opacities[:, 0]
+    if count >= FEWEST_TOLD and (scales > 0).all() and ((opacities >= 0) & (opacities <= 1)).all():
+        raise InputError(f"{path} has activated opacities and scales: export their logits and logarithms, as 3DGS does")
     if "filter_3D" in vertices:
         sizes = torch.from_numpy(vertices["filter_3D"].astype(np.float64))  # [N] standard deviations
         wider = 0.5 * torch.logaddexp(2.0 * scales, 2.0 * sizes.log()[:, None])
