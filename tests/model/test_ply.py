@@ -76,7 +76,7 @@ def test_load_leaves_out_rows_that_are_not_finite_and_refuses_a_model_without_an
     columns["rot_3"][1:3] = np.nan, np.inf
     with pytest.warns(UserWarning, match=r"a\.ply: 2 of 20 Gaussians are not finite and left out"):
         assert len(load_ply(written(tmp_path / "a.ply", columns))) == 18
-    activated = {name: np.full(100, 0.5) for name in columns}
+    activated = {name: np.linspace(0.1, 0.9, 100) for name in columns}
     for case, words in ((columns | {"rot_3": np.full(20, np.nan)}, "none of its 20 "), (activated, "logits")):
         with pytest.raises(InputError, match=words):
             load_ply(written(tmp_path / "a.ply", case))
