@@ -146,7 +146,7 @@ def test_incomplete_and_contradictory_calls(turbogs, capture, tmp_path):
     assert_refused(turbogs("train", capture), "SCENE and --out")
     assert_refused(turbogs("train", "train.iterations=2", "--out", tmp_path / "run"), "no such scene")
     for other in ([capture], ["--device", "cpu"]):
-        assert_refused(turbogs("train", *other, "--resume", tmp_path), "add only")
+        assert_refused(turbogs("train", *other, "--resume", tmp_path), "nothing else")
     for words in (["eval"], ["render"], ["export"], ["train", "--resume"]):
         assert_refused(turbogs(*words, tmp_path), "holds no run")
     assert not list(tmp_path.iterdir())

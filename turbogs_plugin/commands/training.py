@@ -56,7 +56,7 @@ def train(
         raise InputError("--viewer-host says where a viewer listens: give --viewer, too")
     if resume is not None:
         if scene or overrides or out or options != NO_OPTIONS:
-            raise InputError("--resume takes the run's configuration: add only --no-report, --viewer, --gpus, --trust")
+            raise InputError("--resume has its settings: give nothing else but --no-report, --viewer, --gpus, --trust")
     elif trust:
         raise InputError("--trust is for --resume: a configuration that you name yourself is your own word")
     if (target := resume or out) is None or (scene or resume) is None:
@@ -153,9 +153,11 @@ def _tell(session: RunSession, reported: bool) -> int:
     """Print how a training call ended, and give its exit code."""
     folder = session.folder
     if session.signal is not None:
-        own = any(":" in str(section.get("type")) for section in session.trainer.config.to_mapping().values())
-        words = f"--resume {shlex.quote(str(folder.path))}{' --trust' if own else ''}"
-        print(f"stopped and saved: go on with  turbogs train {words}", file=sys.stderr)
+        from turbogs_plugin.config.components import foreign_code
+
+        trust = ["--trust"] if foreign_code(session.trainer.config.to_mapping()) else []
+        words = ["--resume", shlex.quote(str(folder.path)), *trust]
+        print("stopped and saved: go on with  turbogs train", *words, file=sys.stderr)
         return 128 + session.signal
     print(session.wall.text())
     if reported:

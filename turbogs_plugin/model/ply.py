@@ -67,8 +67,7 @@ def read_ply(path: Path) -> tuple[Gaussians, bool]:
     missing = [name for name in names if name not in vertices]
     if missing == ["scale_2"]:
         remedy = "train the capture anew as 3DGS, or draw it with the program that trained it"
-        kind = "a model of 2D Gaussian Splatting, whose disks are drawn otherwise"
-        raise InputError(f"{path} lacks scale_2: it is {kind}: {remedy}")
+        raise InputError(f"{path} lacks scale_2: it is a model of 2D Gaussian Splatting, of disks: {remedy}")
     if missing:
         lacks = f"it lacks the properties {', '.join(missing[:4])}, as a mesh or a cloud of points does"
         raise InputError(f"{path} is not a 3DGS model: {lacks}: give the .ply that a 3DGS trainer exports")
