@@ -45,10 +45,11 @@ for capture in "$@"; do
     wall "cap-${cap}k" "$capture" 1 train.exposure=false "density.max_gaussians=${cap}000"
 done
 wait
-for study in ${STUDIES-paper parts departures density_departures bounds cameras paper_parts}; do
-    ablate "$study" "0 1 2 3 4" "${@:1:3}"
-done
-[ -z "${STUDIES-all}" ] || ablate baselines 0 "${@:1:3}"
+for study in ${STUDIES-paper cameras paper_parts}; do ablate "$study" "0 1 2 3 4" "${@:1:3}"; done
+if [ -n "${STUDIES-all}" ]; then
+    ablate baselines 0 "${@:1:3}"
+    turbogs ablate parts scene.validation=true "${@/#/--scene=}" --gpus "$gpus" --out "$out/parts" --seeds 0
+fi
 
 for file in "$out"/*/results.json; do
     study=docs/lab/$(basename "$(dirname "$file")")

@@ -1,92 +1,88 @@
-"""Tables of docs/paper.md: what each part of the paper is worth, and the paper's configuration beside 3DGS."""
+"""Tables of docs/paper.md: what each part of the paper and each idea of others is worth, and the paper's configuration
+beside 3DGS."""
 
 from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 from studies import CAPTURES, ROWS, Cells, Difference, change, duration, mean, ratio, result, study_cells, table, values
 
-DEFAULTS = ("optimizer", "cameras", "parts", "departures", "density_departures", "bounds")
-"""Studies in which each variant changes one thing of `turbogs`."""
+DEFAULTS = ("parts", "optimizer")
+"""Studies in which each variant changes one thing of `turbogs`, on validation photos of five captures."""
 
-NOTICED = {"psnr": 0.03, "ssim": 0.0005}
-"""A difference below this counts as none, however clear it is."""
+NOTICED = {"psnr": 0.05, "ssim": 0.001}
+"""A mean difference below this counts as none, however clear it is."""
 
 DEARER = 1.1
-"""A part that takes more than this many times the seconds or the Gaussians has a price."""
+"""A part that takes more than this many times the Gaussians has a price."""
 
 BOUND = 0.3
 """dB by which `turbogs-paper` may end below 3DGS at its full length."""
 
 
-class Part(NamedTuple):
-    """A part of the paper.
-
-    Args:
-        name: what it is; in brackets what the full method loses without it, by the paper's table of components.
-        ours: the variants with it and without it in one of `DEFAULTS`, or None.
-        papers: the variants with it and without it in `paper_parts`, or None.
-    """
-
-    name: str
-    ours: tuple[str, str] | None = None
-    papers: tuple[str, str] | None = None
-
-    @property
-    def default(self) -> str:
-        """Whose way `turbogs` takes, where it is one of the two."""
-        if self.ours is None or "turbogs" not in self.ours:
-            return "-"
-        return "the paper's" if self.ours[0] == "turbogs" else "ours"
+Pairs = dict[str, tuple[Cells, Cells]]
+"""Capture -> trainings with a part and without it."""
 
 
-PARTS = [Part(**row) for row in ROWS["paper parts"]]
-
-
-def compared(studies: Sequence[str], variants: tuple[str, str] | None) -> dict[str, tuple[Cells, Cells]]:
-    """Capture -> trainings with a part and without it, where one of the studies has both."""
-    found = {}
-    for capture in (*CAPTURES, "bonsai", "train") if variants else ():
-        for study in studies:
-            cells = [study_cells(study).get(capture, {}).get(name) for name in variants or ()]
-            if all(cells) and Difference.between(*cells, "psnr").count:
-                found[capture] = (cells[0], cells[1])
+def compared(studies: Sequence[str], variants: Sequence[str] | None) -> Pairs:
+    """The captures on which the first study that has both variants has them."""
+    found: Pairs = {}
+    for study in studies if variants else ():
+        for capture, cells in study_cells(study).items():
+            pair = [cells.get(name) for name in variants or ()]
+            if not found.get(capture) and all(pair) and Difference.between(*pair, "psnr").count:
+                found[capture] = (pair[0], pair[1])
+        if found:
+            break
     return found
 
 
-def verdict(pairs: Mapping[str, tuple[Cells, Cells]]) -> str:
-    """Better or worse where a difference in PSNR or SSIM is clear and at least `NOTICED`; and what the part costs."""
+def by_capture(pairs: Pairs, timed: bool) -> str:
+    """A line for each capture."""
+    return "<br>".join(f"{capture}: {change(*pair, timed=timed)}" for capture, pair in pairs.items()) or "-"
+
+
+def over_captures(pairs: Pairs, measure: str) -> Difference:
+    """The mean of the captures' differences, with the standard error that their spread gives it."""
+    found = [Difference.between(*pair, measure).mean for pair in pairs.values()]
+    error = statistics.stdev(found) / math.sqrt(len(found)) if len(found) > 1 else math.nan
+    return Difference(statistics.fmean(found), error, len(found))
+
+
+def means(pairs: Pairs) -> str:
+    """Means over the captures, what they say, and what the change costs."""
     if not pairs:
         return "not measured"
-    said: dict[bool, list[str]] = {True: [], False: []}
-    for capture, pair in pairs.items():
-        for measure, least in NOTICED.items():
-            difference = Difference.between(*pair, measure)
-            if difference.clear and abs(difference.mean) >= least:
-                said[difference.mean > 0].append(f"{measure.upper()} on {capture}")
-    gains, losses = (", ".join(said[better]) for better in (True, False))
-    text = f"better: {gains}" if gains else f"worse: {losses}" if losses else "as good"
-    text = f"mixed: {gains}, but worse {losses}" if gains and losses else text
-    dear = []
-    for measure, unit in (("seconds", "s"), ("gaussians", "Gaussians")):
-        times = statistics.geometric_mean(ratio(*pair, measure) for pair in pairs.values())
-        dear += [f"x {times:.2f} {unit}"] if times > DEARER else []
-    text += f"; dearer: {', '.join(dear)}" if dear else ""
-    return text if len(pairs) >= len(CAPTURES) else f"{text} ({', '.join(pairs)} alone)"
+    psnr, ssim = (over_captures(pairs, measure) for measure in NOTICED)
+    times = statistics.geometric_mean(ratio(*pair, "gaussians") for pair in pairs.values())
+    said: dict[str, list[str]] = {"better": [], "worse": []}
+    for measure, found in (("psnr", psnr), ("ssim", ssim)):
+        if abs(found.mean) >= max(NOTICED[measure], 2 * found.error):
+            said["better" if found.mean > 0 else "worse"].append(measure.upper())
+    verdict = ", ".join(f"{word} in {' and '.join(of)}" for word, of in said.items() if of)
+    figures = f"{psnr.mean:+.2f} ± {psnr.error:.2f} dB, {ssim.mean:+.4f} ± {ssim.error:.4f}, x {times:.2f} N"
+    dearer = "; dearer" if times > DEARER else ""
+    return f"**{verdict or 'no clear difference'}**{dearer}<br>{figures} ({len(pairs)})"
 
 
 def paper_parts() -> str:
-    """Each part: what it adds to `turbogs` and to `turbogs-paper`, the verdict, and whose way the default takes."""
+    """Each part: what it adds to `turbogs` on five captures and to `turbogs-paper` on three, and the default's way."""
     lines = []
-    for part in PARTS:
-        ours, papers = compared(DEFAULTS, part.ours), compared(["paper_parts"], part.papers)
-        texts = ("<br>".join(f"{of}: {change(*pair)}" for of, pair in found.items()) or "-" for found in (ours, papers))
-        said = [verdict(ours)] + ([f"in the paper's: {verdict(papers)}"] if part.papers else [])
-        lines.append((part.name, *texts, "<br>".join(said), part.default))
-    return table(("the paper's part", "in our default", "in the paper's configuration", "verdict", "default"), lines)
+    for row in ROWS["paper parts"]:
+        ours, papers = compared(DEFAULTS, row.get("ours")), compared(["paper_parts"], row.get("papers"))
+        default = ("the paper's" if row["ours"][0] == "turbogs" else "ours") if ours else "-"
+        lines.append((row["name"], means(ours), by_capture(ours, False), by_capture(papers, True), default))
+    head = ("the paper's part", "in our default, mean", "in our default, each capture", "in the paper's configuration")
+    return table((*head, "default"), lines)
+
+
+def ideas() -> str:
+    """Each idea of others: what it adds to `turbogs`."""
+    rows = [(*row.values(), compared(["ideas"], (row["of"], "turbogs"))) for row in ROWS["ideas"]]
+    lines = [(name, prediction, means(pairs), by_capture(pairs, False)) for name, _, prediction, pairs in rows]
+    return table(("idea, and how it was built", "prediction", "mean", "each capture"), lines)
 
 
 def best_psnr(cells: Cells) -> float:
@@ -115,7 +111,7 @@ def paper_whole() -> str:
         "3DGS, 30,000 iterations": ("baselines", "3dgs"),
         "`turbogs-paper`": ("paper", "turbogs-paper"),
         "`paper-literal`, without the repair": ("paper", "paper-literal"),
-        "`turbogs`": ("departures", "turbogs"),
+        "`turbogs`": ("cameras", "turbogs"),
     }
     found = {name: [study_cells(study)[of][variant] for of in CAPTURES] for name, (study, variant) in entries.items()}
     lines = [(name, *map(whole_run, cells)) for name, cells in found.items()]

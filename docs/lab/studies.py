@@ -148,14 +148,16 @@ def ratio(cells: Cells, base: Cells, measure: str) -> float:
     return own / of_base
 
 
-def change(cells: Cells, base: Cells, errors: str = "") -> str:
+def change(cells: Cells, base: Cells, errors: str = "", timed: bool = True) -> str:
     """Differences in PSNR and SSIM, ratios of seconds and Gaussians, and how many seeds.
 
     Args:
         errors: "refined_": by refined cameras of the test photos.
+        timed: the seconds mean something.
     """
     psnr, ssim = (Difference.between(cells, base, f"{errors}{measure}") for measure in ("psnr", "ssim"))
-    ratios = f"x {ratio(cells, base, 'seconds'):.2f} s, x {ratio(cells, base, 'gaussians'):.2f} N"
+    seconds = f"x {ratio(cells, base, 'seconds'):.2f} s, " if timed else ""
+    ratios = f"{seconds}x {ratio(cells, base, 'gaussians'):.2f} N"
     return f"{psnr.text(2, ' dB')}, {ssim.text(4)}, {ratios} ({psnr.count})"
 
 
