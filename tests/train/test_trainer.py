@@ -30,6 +30,7 @@ from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.strategies.density.rows import NoDensity
 from turbogs_plugin.strategies.losses import CharbonnierLoss
 from turbogs_plugin.strategies.protocols import SparseLoss
+from turbogs_plugin.strategies.returned import require_rows
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import read_history
@@ -37,7 +38,7 @@ from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.run import fit
 from turbogs_plugin.train.session import interruptible
-from turbogs_plugin.train.trainer import Trainer, require_rows
+from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import LossOutput, PixelSamples, RowUpdate
 from turbogs_plugin.yaml_json import parse_yaml
 

@@ -1,0 +1,51 @@
+"""What a strategy returned: each check raises `InputError`, which names the strategy and the remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError
+from turbogs_plugin.strategies.protocols import DensityController, PixelSampler, SparseLoss
+from turbogs_plugin.types import PARAMETER_NAMES, LossOutput, PixelSamples, RowUpdate
+
+
+def require_type(value: object, kind: type, strategy: object) -> None:
+    """Raise `InputError` unless what a strategy returned is of this type."""
+    if not isinstance(value, kind):
+        raise InputError(f"{type(strategy).__name__} returned {type(value).__name__}, not {kind.__name__}")
+
+
+def require_samples(samples: PixelSamples, view_ids: Sequence[int], sizes: np.ndarray, sampler: PixelSampler) -> None:
+    """Raise `InputError` unless `samples` are of these views in this order, and of their `sizes` [K, 2]."""
+    require_type(samples, PixelSamples, sampler)
+    for what, found, wanted in (("view_ids", samples.view_ids, view_ids), ("sizes", samples.sizes, sizes)):
+        if not np.array_equal(found, wanted):
+            said = f"returned samples with {what} {np.array(found).tolist()}, not {np.array(wanted).tolist()}"
+            raise InputError(f"{type(sampler).__name__} {said}: give view_ids, and masks [K, H, W], to from_mask")
+
+
+def require_rows(update: RowUpdate, controller: DensityController) -> None:
+    """Raise `InputError` unless the parts of a change of rows fit together."""
+    require_type(update, RowUpdate, controller)
+    count, kind = len(update.source), update.source.dtype
+    wrong = [f"values of {name}" for name in update.values if name not in PARAMETER_NAMES]
+    wrong += [f"{len(value)} values of {name}" for name, value in update.values.items() if len(value) != count]
+    wrong += [f"fresh of {len(update.fresh)} rows"] if len(update.fresh) != count else []
+    wrong += [f"source of {kind}"] if kind != torch.int64 else []
+    if wrong:
+        said = f"{type(controller).__name__} returned a RowUpdate of {count} rows with {wrong[-1]}"
+        raise InputError(f"{said}: source has old rows, as of torch.nonzero; fresh and parameters' values as many")
+
+
+def require_output(output: LossOutput, colors: Tensor, loss: SparseLoss) -> None:
+    """Raise `InputError` unless the shapes of a `LossOutput` fit colours [P, 3]."""
+    require_type(output, LossOutput, loss)
+    shapes = {"loss": (), "color_gradients": tuple(colors.shape), "pixel_errors": (len(colors),)}
+    for field, shape in shapes.items():
+        found = tuple(getattr(output, field).shape)
+        if found != shape:
+            raise InputError(f"{type(loss).__name__} returned {field} of shape {found}, not {shape}")
