@@ -117,7 +117,7 @@ def test_a_resumed_run_has_the_same_cameras(turbogs, capture, tmp_path):
     settings += ("train.iterations=6", "train.refine_until=3", "train.checkpoint_every=3", "--no-report")
     code, _, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *settings)
     assert code == 0, err
-    assert "7 of 7 training cameras refined" in err and err.count("by refined cameras") == 1
+    assert "7 of 7 training cameras refined" in err and err.count("by refined test cameras") == 1
     shutil.copytree(tmp_path / "run", tmp_path / "again")
     (tmp_path / "again" / "checkpoints" / "iteration-000006.pt").unlink()
     code, _, err = turbogs("train", "--resume", tmp_path / "again", "--no-report")

@@ -90,7 +90,7 @@ def test_a_saved_run_is_shown_as_its_trainer_is(capture, scene, tmp_path):
     run = tmp_path / "run"
     outcome = train(tiny_config(capture, "train.exposure=true"), run)
     assert 0 < read_history(outcome.folder.history)[-1].own_ssim < 1
-    assert "PSNR in dB of the model's own colours" in write_report(outcome).read_text()
+    assert "| mean of the model's own colours |" in write_report(outcome).read_text()
     trainer = outcome.trainer
     state = load_checkpoint(latest_checkpoint(outcome.folder.checkpoints))
     state["trainer"]["exposures"]["offsets"] = torch.linspace(-0.3, 0.2, 7)[:, None, None].expand(7, 3, 4).clone()

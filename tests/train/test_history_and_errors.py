@@ -81,7 +81,7 @@ def test_progress_is_a_line_an_evaluation_where_there_is_no_terminal(capsys):
         progress.evaluated(training(10, 5), evaluation(10, skipped_updates=3, refined_psnr=21.0, refined_ssim=0.9))
     (line,) = capsys.readouterr().err.splitlines()
     assert "10/100" in line and "20.10 dB" in line
-    assert line.endswith("  3 skipped updates  14 s left  by refined cameras 21.00 dB, 0.9000")
+    assert line.endswith("  3 skipped updates  14 s left  by refined test cameras 21.00 dB, SSIM 0.9000")
 
 
 def test_progress_is_a_line_that_goes_on_a_terminal(capsys, monkeypatch):

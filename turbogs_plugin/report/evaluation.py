@@ -12,7 +12,7 @@ import torch
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.errors import InputError, refusal
 from turbogs_plugin.files import write_text_atomically
-from turbogs_plugin.report.tables import short_table
+from turbogs_plugin.report.tables import explained, short_table
 from turbogs_plugin.scene import PosedImages, Scene
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.history import without_nan
@@ -33,7 +33,7 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
     views = place_views(views, model.gaussians.device, model.config.train.pixels_place)
     lpips, reason = load_lpips(model.gaussians.device)
     metrics = evaluate(model.gaussians, views, look, lpips, refined=True)
-    mean, notes = metrics.mean, [f"LPIPS was not computed: {reason}"] if reason else []
+    mean, notes = metrics.mean, explained(metrics) + ([f"LPIPS was not computed: {reason}"] if reason else [])
     if model.folder is not None:
         counts = {"iteration": model.iteration, "num_gaussians": len(model.gaussians), "fps": metrics.fps}
         end = {**counts, "mean": without_nan(mean), "views": [without_nan(view) for view in metrics.views]}

@@ -12,7 +12,7 @@ from turbogs_plugin.files import read_text, write_text_atomically
 from turbogs_plugin.report.evaluation import load_lpips
 from turbogs_plugin.report.images import ERROR_FULL_SCALE, save_image, strip, titled
 from turbogs_plugin.report.provenance import hardware, software
-from turbogs_plugin.report.tables import ERRORS, error_columns, errors, escaped, table, views_table
+from turbogs_plugin.report.tables import ERRORS, error_rows, errors_table, escaped, explained, number, table
 from turbogs_plugin.strategies.view_sampling import doubted
 from turbogs_plugin.train.metrics import Metrics, evaluate, render_view
 from turbogs_plugin.train.session import RunSession
@@ -63,35 +63,23 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int, doub
     picture, and photos that training doubted with times the median that their error is."""
     last, plan = run.history[-1], read_text(run.folder.plan) or "The run's folder holds no plan."
     config = run.trainer.config
-    columns = error_columns(metrics)
     masked = run.test.masks is not None
     unmasked = ", without their masked pixels" if masked else ""
-    on = ""
+    on, (views, means) = explained(metrics), error_rows(metrics)
     if run.test.photos.transparent:
         red, green, blue = (round(255 * value) for value in run.trainer.background.evaluated)
-        on = f" Photos are transparent; they and the model are compared on rgb({red}, {green}, {blue})."
-    if "own_l1" in columns:
-        on += (
-            " Training photos have exposures of their own. A test photo is compared with the render in the exposure of"
-            " the training photos before and after it; beside that stand errors of the model's own colours."
-        )
-    if "refined_l1" in columns:
-        on += (
-            " Test photos are compared with renders by the cameras that the capture gives them. Beside that stand"
-            " errors by cameras that were found by where each test photo shows the points."
-        )
+        on.insert(0, f"Photos are transparent; they and the model are compared on rgb({red}, {green}, {blue}).")
+    on += [f"LPIPS was not computed: {lpips_reason}."] if lpips_reason else []
     grey = "; masked pixels of photo and error are grey" if masked else ""
-    heads = (*columns.values(), "training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB")
+    heads = ("training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB")
     wall = run.wall.wall_seconds
-    rows = [
-        [of.iteration, f"{of.train_seconds:.1f}", *errors(of), of.num_gaussians, of.memory_bytes // 2**20]
-        for of in run.history
-    ]
+    rows = []
+    for of in run.history:
+        errors = (number(value, digits) for value, digits in ((of.psnr, 2), (of.ssim, 4), (of.l1, 4)))
+        rows.append([of.iteration, f"{of.train_seconds:.1f}", *errors, of.num_gaussians, of.memory_bytes // 2**20])
     seconds, *_, count, memory = rows[-1][1:]
     whole = "not recorded" if wall is None else f"{wall:.1f}"
-    cells = [*errors(metrics.mean, columns), seconds, whole, count, f"{metrics.fps:.1f}", memory]
-    result = table(heads, [cells])
-    lpips = f"\nLPIPS was not computed: {lpips_reason}.\n" if lpips_reason else ""
+    cost = table(heads, [[seconds, whole, count, f"{metrics.fps:.1f}", memory]])
     history = table(("iteration", "training in s", *ERRORS.values(), "Gaussians", "peak memory in MiB"), rows)
     strips = "\n\n".join(
         f"{escaped(view.name)}: {view.psnr:.2f} dB\n\n![{escaped(view.name)}](report/test-{view_id:03d}.jpg)"
@@ -106,14 +94,17 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int, doub
     folder = shlex.quote(str(run.folder.path))
     return f"""# {escaped(run.scene.name)}
 
-{last.iteration} iterations on {len(run.scene.train)} training views, seed {config.train.seed}; measured on
-{len(metrics.views)} test views.
+{last.iteration} iterations on {len(run.scene.train)} training views, seed {config.train.seed}.
 
-{result}
-{lpips}
-Means over the test views{unmasked}. Training time is that of iterations and of the initial error maps; loading,
-evaluation, checkpoints and this report are not in it. Wall time is from the start of the command until the model was
-written. FPS counts test views rendered one after the other.{on}
+{errors_table(means)}
+
+{cost}
+
+Errors are means over the test views{unmasked}. {" ".join(on)}
+
+Training time is that of iterations and of the initial error maps; loading, evaluation, checkpoints and this report are
+not in it. Wall time is from the start of the command until the model was written. FPS counts test views rendered one
+after the other.
 
 `turbogs export {folder} --format html` writes a page with the model to turn in a browser, `model.html`. The run's
 configuration is in [config.yaml](config.yaml).
@@ -132,7 +123,7 @@ From left to right: photo, render, error (mean absolute difference over RGB: bla
 
 {strips}
 
-{views_table(metrics)}
+{errors_table(views)}
 {doubted_photos}
 ## Plan
 

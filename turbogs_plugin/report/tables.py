@@ -6,14 +6,24 @@ import math
 import re
 from collections.abc import Iterable
 
-from turbogs_plugin.train.history import Evaluation
-from turbogs_plugin.train.metrics import Metrics, ViewMetrics
+from turbogs_plugin.train.metrics import Metrics
 
 ERRORS = {"psnr": "PSNR in dB", "ssim": "SSIM", "l1": "mean absolute error"}
 """Measure -> head of its column, in every table of errors. Masked pixels do not count in them."""
 
-FURTHER = {"own": "of the model's own colours", "refined": "by refined test cameras"}
-"""Kind of `FurtherErrors` -> what the head of its column adds."""
+FURTHER = {
+    "own": (
+        "of the model's own colours",
+        "A test photo is compared with the render in the exposure of the training photos before and after it; the"
+        " model's own colours are without exposures.",
+    ),
+    "refined": (
+        "by refined test cameras",
+        "Renders are by the cameras that the capture gives to test photos; refined test cameras were found by where"
+        " each test photo shows the points.",
+    ),
+}
+"""Kind of `FurtherErrors` -> what the name of its row adds, and how they differ from the plain errors."""
 
 
 def escaped(text: object) -> str:
@@ -33,34 +43,36 @@ def number(value: float, digits: int, absent: str = "not computed") -> str:
     return absent if math.isnan(value) else f"{value:.{digits}f}"
 
 
-def errors(measured: ViewMetrics | Evaluation, columns: Iterable[str] = ERRORS) -> list[str]:
-    """The values of some measures as cells of a table."""
-    return [number(getattr(measured, name), 2 if "psnr" in name else 4) for name in columns]
+def explained(metrics: Metrics) -> list[str]:
+    """A sentence for each kind of `FurtherErrors` that was computed."""
+    return [said for kind, (_, said) in FURTHER.items() if not math.isnan(getattr(metrics.mean, f"{kind}_l1"))]
 
 
-def error_columns(metrics: Metrics) -> dict[str, str]:
-    """Measure -> head of its column, for all measures of a model's test views: `ERRORS`, LPIPS, and the kinds
-    of `FurtherErrors` that were computed."""
-    mean = metrics.mean.further()
-    computed = {kind: said for kind, said in FURTHER.items() if not math.isnan(mean[f"{kind}_l1"])}
-    further = {f"{kind}_{name}": f"{ERRORS[name]} {said}" for kind, said in computed.items() for name in ERRORS}
-    return ERRORS | {"lpips": "LPIPS (VGG)"} | further
+Row = tuple[str, float, float, float, float]
+"""Name, PSNR in dB, SSIM, mean absolute error and LPIPS; NaN where one was not computed."""
 
 
-def views_table(metrics: Metrics) -> str:
-    """A table with the errors of each test view."""
-    columns = error_columns(metrics)
-    return table(["view", *columns.values()], [[view.name, *errors(view, columns)] for view in metrics.views])
+def error_rows(metrics: Metrics) -> tuple[list[Row], list[Row]]:
+    """Rows of the test views, and of means over them, where the plain ones are last."""
+    mean = metrics.mean
+    views, means = ([(of.name, of.psnr, of.ssim, of.l1, of.lpips) for of in these] for these in (metrics.views, [mean]))
+    for kind, (name, _) in FURTHER.items():
+        psnr, ssim, l1 = (getattr(mean, f"{kind}_{measure}") for measure in ERRORS)
+        if not math.isnan(l1):
+            means.insert(-1, (f"mean {name}", psnr, ssim, l1, math.nan))
+    return views, means
+
+
+def errors_table(rows: Iterable[Row]) -> str:
+    """A table of errors."""
+    cells = [[name, *map(number, values, (2, 4, 4, 4))] for name, *values in rows]
+    return table(["", *ERRORS.values(), "LPIPS (VGG)"], cells)
 
 
 def short_table(metrics: Metrics) -> str:
     """PSNR in dB, SSIM and, where it was computed, LPIPS, for a terminal: of each test view, then the means."""
-    mean, views = metrics.mean, [(view.name, view.psnr, view.ssim, view.lpips) for view in metrics.views]
-    for kind, said in FURTHER.items():
-        if not math.isnan(getattr(mean, f"{kind}_psnr")):
-            views.append((f"mean {said}", getattr(mean, f"{kind}_psnr"), getattr(mean, f"{kind}_ssim"), math.nan))
-    rows = [["view", "PSNR", "SSIM", *([] if math.isnan(mean.lpips) else ["LPIPS"])]]
-    for name, *values in (*views, (mean.name, mean.psnr, mean.ssim, mean.lpips)):
-        rows.append([name, *(number(value, digits, "") for value, digits in zip(values, (2, 4, 4), strict=True))])
-    width = max(len(row[0]) for row in rows)
-    return "\n".join(f"{row[0]:<{width}}" + "".join(f"  {cell:>6}" for cell in row[1 : len(rows[0])]) for row in rows)
+    rows, (views, means) = [["view", "PSNR", "SSIM", "LPIPS"]], error_rows(metrics)
+    for name, psnr, ssim, _, lpips in (*views, *means):
+        rows.append([name, number(psnr, 2), number(ssim, 4, ""), number(lpips, 4, "")])
+    width, columns = max(len(row[0]) for row in rows), 3 if math.isnan(metrics.mean.lpips) else 4
+    return "\n".join(f"{row[0]:<{width}}" + "".join(f"  {cell:>6}" for cell in row[1:columns]) for row in rows)

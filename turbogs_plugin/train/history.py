@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +29,6 @@ class FurtherErrors:
     refined_psnr: float = field(default=math.nan, repr=False)
     refined_ssim: float = field(default=math.nan, repr=False)
     refined_l1: float = field(default=math.nan, repr=False)
-
-    def further(self) -> dict[str, float]:
-        """These errors alone, by name."""
-        return {field.name: getattr(self, field.name) for field in fields(FurtherErrors)}
 
 
 @dataclass

@@ -185,7 +185,7 @@ class Evaluations(Listener):
         trainer = loop.trainer
         trainer.require_finite()
         metrics = evaluate(trainer.gaussians, self.test, trainer.look(self.test.names), refined=loop.finished)
-        mean, self.metrics = metrics.mean, metrics
+        mean, self.metrics = asdict(metrics.mean), metrics
         evaluation = Evaluation(
             iteration=trainer.iteration,
             train_seconds=loop.clock.seconds,
@@ -194,8 +194,7 @@ class Evaluations(Listener):
             nonfinite_losses=int(trainer.nonfinite_losses),
             skipped_updates=int(trainer.optimizer.skipped),
             worst_psnr=metrics.worst_psnr,
-            **{measure: getattr(mean, measure) for measure in MEASURES},
-            **mean.further(),
+            **{measure: value for measure, value in mean.items() if measure not in ("name", "lpips")},
         )
         self.history.append(evaluation)
         if self.callback is not None:

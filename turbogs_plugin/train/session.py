@@ -227,8 +227,8 @@ class TrainingProgress(Listener):
         elif iteration < total:
             mean = (evaluation.train_seconds - self._before) / iteration
             further.append(f"{mean * (total - iteration):,.0f} s left")
-        if not math.isnan(evaluation.refined_psnr):
-            further.append(f"by refined cameras {evaluation.refined_psnr:.2f} dB, {evaluation.refined_ssim:.4f}")
+        if not math.isnan(psnr := evaluation.refined_psnr):
+            further.append(f"by refined test cameras {psnr:.2f} dB, SSIM {evaluation.refined_ssim:.4f}")
         said = (
             f"iteration {iteration:>{len(str(total))}}/{total}  {evaluation.train_seconds:7.1f} s  test PSNR"
             f" {evaluation.psnr:.2f} dB  SSIM {evaluation.ssim:.4f}  {evaluation.num_gaussians} Gaussians"
