@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import sys
 from collections.abc import Sequence
 
@@ -27,6 +28,14 @@ def synchronize(device: torch.device) -> None:
 def processor_cores() -> int:
     """The cores that this process may use: a container or a job may have fewer than the machine."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def cpu_note() -> str:
+    """A line about a training on the CPU."""
+    note = "training on the CPU takes hundreds of times as long as on a GPU: --factor 4 and --time-budget shorten it"
+    if torch.version.cuda is None and shutil.which("nvidia-smi"):
+        note += "; an NVIDIA GPU is here, and this PyTorch is built without CUDA: install one with it (pytorch.org)"
+    return note
 
 
 def free_device_memory(device: torch.device) -> None:

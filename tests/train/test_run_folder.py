@@ -57,7 +57,7 @@ def test_a_folder_has_one_owner_and_a_dead_one_has_none(holder, tmp_path, capsys
 
 def test_a_run_and_its_resume_are_refused_while_another_writes(holder, capture, tmp_path, monkeypatch):
     folder = RunFolder(tmp_path / "run")
-    monkeypatch.setattr(RunFolder, "require_new", lambda folder: None)  # both began at once
+    monkeypatch.setattr(RunFolder, "require_new", lambda folder, overwrite: None)  # both began at once
     config = tiny_config(capture, "train.iterations=2")
     assert_refused("writes to", run.train, config, folder.path)
     folder.config.write_text(config.without_plan().to_yaml())
@@ -94,6 +94,25 @@ def test_a_run_that_ends_before_its_first_checkpoint_does_not_claim_its_folder(c
     run.train(config, folder.path)
     assert [line.iteration for line in read_history(folder.history)] == [0, 2]
     assert_refused("is not empty: choose a new folder", run.train, config, folder.path)
+
+
+def test_an_overwritten_run_comes_back_where_the_new_one_fails(capture, tmp_path, monkeypatch, capsys):
+    """And goes where the new one has a checkpoint. Nothing but a run is overwritten."""
+    folder, config = RunFolder(tmp_path / "run"), tiny_config(capture, "train.iterations=2", "train.evaluate_at=[]")
+    run.train(config, folder.path)
+    before = {path.name: path.stat().st_ino for path in folder.path.iterdir()}
+    for error in (InputError("bad"), IndexError("bad")):
+        with monkeypatch.context() as patch, pytest.raises(type(error), match="bad"):
+            patch.setattr(Trainer, "step", lambda trainer, error=error: (_ for _ in ()).throw(error))
+            run.train(config, folder.path, overwrite=True)
+        assert {path.name: path.stat().st_ino for path in folder.path.iterdir()} == before
+        assert f"lies in '{folder.aside}'" in capsys.readouterr().err and not folder.aside.exists()
+    for other in (folder.path / "notes.txt", folder.aside):
+        other.touch()
+        assert_refused(str(other), run.train, config, folder.path, overwrite=True)
+        other.unlink()
+    run.train(config.changed(train={"seed": 5}), folder.path, overwrite=True)
+    assert folder.read_config().train.seed == 5 and not folder.aside.exists()
 
 
 WRITERS = {

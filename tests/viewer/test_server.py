@@ -193,7 +193,7 @@ def test_bad_input_is_one_line(turbogs, tmp_path, capture):
             ("view", points, "--port", port): f"127.0.0.1:{port}",
             ("view", points, "--host", "192.0.2.1"): "192.0.2.1:8080",
             ("train", capture, "--out", out, "--viewer", port): f"127.0.0.1:{port}",
-            ("train", capture, "--out", out, "--viewer-host", "0.0.0.0"): "--viewer",
+            ("train", capture, "--out", out, "--viewer", "0.0.0.0"): "--viewer 0.0.0.0: write a port",
             ("view", points, "--factor", "2"): "--scene",
         }
         for command, named in cases.items():

@@ -104,3 +104,11 @@ def require_positive(option: str, *values: float | None) -> None:
     """Raise `InputError` unless the values of an option, where there are any, are all above 0."""
     if not all(value is None or 0 < value < math.inf for value in values):
         raise InputError(f"{option} {' '.join(map(str, values))}: it must be above 0 and finite, or left out")
+
+
+def address(option: str, words: tuple[str, ...]) -> tuple[str, int]:
+    """Host and port of ``[HOST:]PORT``, which are `words` of an option. Raises `InputError` for other words."""
+    host, _, port = " ".join(words).rpartition(":")
+    if not port.isdecimal():
+        raise InputError(f"{option} {' '.join(words)}: write a port, as 8080, or host and port, as 0.0.0.0:8080")
+    return host.strip("[]") or LOCAL, int(port)

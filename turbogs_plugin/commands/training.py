@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from turbogs_plugin.commands.options import LOCAL, NO_OPTIONS, PORT, Count, Flat, Overrides, Scene, require_positive
+from turbogs_plugin.commands.options import NO_OPTIONS, PORT, Count, Flat, Overrides, Scene, address, require_positive
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.train.wall import WallClock
 
@@ -29,8 +29,8 @@ def train(
     out: Annotated[Path | None, arg(metavar="RUN")] = None,
     resume: Annotated[Path | None, arg(metavar="RUN")] = None,
     report: bool = True,
-    viewer: Annotated[tuple[int, ...] | None, arg(metavar="[PORT]")] = None,
-    viewer_host: str = LOCAL,
+    overwrite: FlagCreatePairsOff[bool] = False,
+    viewer: Annotated[tuple[str, ...] | None, arg(metavar="[[HOST:]PORT]")] = None,
     gpus: Count = None,
     trust: FlagCreatePairsOff[bool] = False,
     options: Flat = NO_OPTIONS,
@@ -43,19 +43,19 @@ def train(
         overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none; turbogs plan without a
             SCENE lists all settings.
         out: new folder for the run.
+        overwrite: replace a run that --out holds. It is put aside until the new one ends, and comes back if that fails
+            before its first checkpoint.
         resume: folder of a stopped run to go on with, by its own configuration.
         report: at the end, write the report and its pictures; --no-report leaves model, history and checkpoints.
         viewer: show the training in a browser, at this port (or 8080); afterwards its model, until Ctrl-C.
-        viewer_host: address where the viewer listens; 0.0.0.0 lets others on the network look, and pause the training.
+            0.0.0.0:8080 lets others on the network look, and pause the training.
         gpus: number of this machine's GPUs that train one model, a process each; torchrun does the same on several
             machines. docs/scaling.md says what they gain.
         trust: with --resume, run the code that the run's configuration names and that is not installed.
     """
     clock = WallClock()
-    if viewer is None and viewer_host != LOCAL:
-        raise InputError("--viewer-host says where a viewer listens: give --viewer, too")
     if resume is not None:
-        if scene or overrides or out or options != NO_OPTIONS:
+        if scene or overrides or out or overwrite or options != NO_OPTIONS:
             raise InputError("--resume has its settings: give nothing else but --no-report, --viewer, --gpus, --trust")
     elif trust:
         raise InputError("--trust is for --resume: a configuration that you name yourself is your own word")
@@ -64,6 +64,7 @@ def train(
     require_positive("--gpus", gpus)
     if viewer is not None and (gpus or 1) > 1:
         raise InputError(VIEWER_ON_ONE)
+    host, port = address("--viewer", viewer or (str(PORT),))
     from turbogs_plugin.distributed.processes import joined, launched, restarts, start
     from turbogs_plugin.report.run_report import write_report
     from turbogs_plugin.train import run
@@ -74,6 +75,8 @@ def train(
     if resume and viewer is None and folder.finished(report):
         print(f"{resume} is finished: its model is {folder.model}")
         return 0
+    if overwrite and (launched() or (gpus or 1) > 1):
+        raise InputError("--overwrite is for one process: remove the older run yourself, or leave out --gpus")
     if gpus is not None and gpus > 1 and not launched():
         if resume is None:
             folder.require_new()
@@ -87,11 +90,11 @@ def train(
             from turbogs_plugin.viewer.live import LiveViewer
             from turbogs_plugin.viewer.server import Page
 
-            live = LiveViewer(Page(viewer_host, viewer[0] if viewer else PORT, training=True))
+            live = LiveViewer(Page(host, port, training=True))
             pages.callback(live.page.close)
             watch.append(live.watch)
         if resume is None and not (restarts() and folder.config.is_file()):
-            session = run.train(settings, target, page, clock, ranks, watch)
+            session = run.train(settings, target, page, clock, ranks, watch, overwrite)
         else:  # a configuration that this command has written itself is trusted
             session = run.resume(target, page, clock, ranks, watch, trust or resume is None)
         code = _tell(session, report) if ranks.first else 128 + session.signal if session.signal else 0
@@ -159,7 +162,8 @@ def _tell(session: RunSession, reported: bool) -> int:
         words = ["--resume", shlex.quote(str(folder.path)), *trust]
         print("stopped and saved: go on with  turbogs train", *words, file=sys.stderr)
         return 128 + session.signal
-    print(session.wall.text())
+    wall = session.wall.wall_seconds
+    print(f"trained {session.wall.train_seconds:.1f} s" + ("" if wall is None else f", {wall:.1f} s on the wall"))
     if reported:
         print(f"report  {folder.report}\nrenders {folder.path / 'report'}")
     print(f"model   {folder.model}")

@@ -99,7 +99,9 @@ def measure_agreement(model: pycolmap.Reconstruction, database: Path) -> Agreeme
         for view, image in enumerate(images):
             camera = model.cameras[image.camera_id]
             viewmats[view, :3] = image.cam_from_world().matrix()
-            rays.append(_rays(camera, opened.read_keypoints(numbers[view])[:, :2]))
+            keypoints = opened.read_keypoints(numbers[view])[:, :2].astype(np.float64)
+            plane = np.array(camera.cam_from_img(keypoints)).reshape(-1, 2)  # NaN where the camera has no ray
+            rays.append(np.concatenate([plane, np.ones((len(plane), 1))], axis=1))  # [N, 3]
             limits.append(EPIPOLAR_SHARE * max(camera.width, camera.height) / camera.mean_focal_length())
         for number, geometry in zip(*opened.read_two_view_geometries(), strict=True):
             first, second = (views.get(identifier) for identifier in pycolmap.pair_id_to_image_pair(number))
@@ -169,9 +171,3 @@ def _pycolmap() -> ModuleType:
 def _tell(step: str) -> None:
     """Say on stderr which step has ended."""
     print(step, file=sys.stderr, flush=True)
-
-
-def _rays(camera: pycolmap.Camera, keypoints: np.ndarray) -> np.ndarray:
-    """[N, 3] rays, z = 1, of [N, 2] pixels; NaN where the camera has none."""
-    plane = np.array(camera.cam_from_img(keypoints.astype(np.float64))).reshape(-1, 2)
-    return np.concatenate([plane, np.ones((len(plane), 1))], axis=1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import shutil
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -36,14 +35,6 @@ def require_device(name: str) -> None:
     """`resolve_device`, for its error alone: by the driver's list, as CUDA itself starts while photos are decoded."""
     if name == "cuda" and torch.cuda.device_count() == 0:
         resolve_device(name)
-
-
-def cpu_note() -> str:
-    """A line about a training on the CPU."""
-    note = "training on the CPU takes hundreds of times as long as on a GPU: --factor 4 and --time-budget shorten it"
-    if torch.version.cuda is None and shutil.which("nvidia-smi"):
-        note += "; an NVIDIA GPU is here, and this PyTorch is built without CUDA: install one with it (pytorch.org)"
-    return note
 
 
 def show_loading(loaded: int, total: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from turbogs_plugin.captures.load import holds_photos_alone
 from turbogs_plugin.config.components import KINDS, completed
 from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, resolve
 from turbogs_plugin.config.scaling import with_iterations
-from turbogs_plugin.device import free_bytes
+from turbogs_plugin.device import cpu_note, free_bytes
 from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine.layout import MAX_VIEWS
 from turbogs_plugin.errors import InputError, nearest
@@ -30,7 +30,7 @@ from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.strategies.protocols import Strategies
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import Evaluation, rewind_history
-from turbogs_plugin.train.inputs import cpu_note, open_scene, open_started, require_device, resolve_device
+from turbogs_plugin.train.inputs import open_scene, open_started, require_device, resolve_device
 from turbogs_plugin.train.loop import TrainingLoop
 from turbogs_plugin.train.metrics import Evaluations, Metrics
 from turbogs_plugin.train.pace import Pace, fitted_to_time
@@ -169,6 +169,7 @@ def train(
     clock: WallClock | None = None,
     ranks: Ranks = ONE,
     watch: Watch = (),
+    overwrite: bool = False,
 ) -> RunSession:
     """Train from the start into a new folder. The plan is printed first. Photos alone are reconstructed before.
 
@@ -176,6 +177,7 @@ def train(
         report: called with the finished run; `turbogs_plugin.report.run_report.write_report` writes its page.
         clock: of the wall; None: it begins now.
         ranks: the processes that train this model together; each calls this, and the first one writes and prints.
+        overwrite: a run that the folder holds is `RunFolder.replaced`.
 
     Raises:
         InputError: anything wrong with the input; then nothing was written.
@@ -186,7 +188,7 @@ def train(
     folder = RunFolder(out)
     require_device(config.train.device)
     if ranks.first:
-        folder.require_new()
+        folder.require_new(overwrite)
     if config.train.starts_from_model:
         require_model(config.train.init)  # before minutes of photos
     posed = ranks.agree(_posed_capture(config, out) if ranks.first else "")
@@ -199,7 +201,11 @@ def train(
     with _fitting(scene):
         loop = new_loop(_independent(plan.apply(config), device), scene, device, ranks, plan.facts.gains)
         session = RunSession(folder, scene, loop, clock)
-    with folder.owned(new=True) if ranks.first else nullcontext():
+    with ExitStack() as held:
+        if overwrite:
+            held.enter_context(folder.replaced())
+        if ranks.first:
+            held.enter_context(folder.owned(new=True))
         if ranks.first:
             resolved, told = loop.trainer.config, [*scene.notes, plan.text()]
             if resolved.budget.time:

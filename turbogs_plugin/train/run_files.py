@@ -27,13 +27,23 @@ class RunFolder:
         self.history, self.wall, self.metrics = path / "history.jsonl", path / "wall.json", path / "metrics.json"
         self.lock, self.owner = path / ".lock", path / ".owner"
         self.checkpoints, self.model, self.report = path / "checkpoints", path / "model.ply", path / "report.md"
-        self.renders = path / "renders"
+        self.renders, self.aside = path / "renders", Path(f"{path}.replaced")
         self._begun = (self.asked, self.config, self.plan, self.history, self.checkpoints)
 
-    def require_new(self) -> None:
-        """Raise `InputError` if the folder cannot be made, or holds more than a run without a checkpoint leaves."""
+    def require_new(self, overwrite: bool = False) -> None:
+        """Raise `InputError` if the folder cannot be made, or holds more than a run without a checkpoint leaves; or, to
+        `overwrite`, more than a run and its exports."""
         if self.path.exists() and not (self.path.is_dir() and self._unclaimed()):
-            raise InputError(f"--out '{self.path}' is not empty: choose a new folder, or go on with a run by --resume")
+            if not overwrite or not self.asked.is_file() or self.path.is_symlink():
+                remedy = "choose a new folder; --resume goes on with a run, --overwrite replaces one"
+                raise InputError(f"--out '{self.path}' is not empty: {remedy}")
+            ours = {*self._begun, self.lock, self.owner, self.wall, self.metrics, self.model, self.report, self.renders}
+            ours |= {self.path / "report", self.path / "export.ply", *self.path.glob("model.*")}
+            if others := {*self.path.iterdir()} - ours:
+                raise InputError(f"--overwrite: '{min(others)}' is of no training: take it out of the folder first")
+            if self.aside.exists():
+                raise InputError(f"--overwrite: '{self.aside}' is there, an older run: move it or remove it")
+            require_writable(self.aside, f"--overwrite: '{self.aside}'")
         require_writable(self.path, f"--out '{self.path}'")
 
     def require_own(self) -> None:
@@ -48,6 +58,25 @@ class RunFolder:
         there = {*self.path.iterdir()} - {self.lock, self.owner}
         begun = self.asked in there and there <= {*self._begun} and latest_checkpoint(self.checkpoints) is None
         return begun or not there
+
+    @contextmanager
+    def replaced(self) -> Iterator[None]:
+        """While entered, the run that the folder holds lies in `aside`. At the end it is removed; or it comes back,
+        where the new one has no checkpoint. Raises `InputError` where another process writes to it."""
+        if not self.path.exists() or self._unclaimed():
+            yield
+            return
+        with self.owned():
+            self.owner.unlink()
+            self.path.rename(self.aside)
+        print(f"turbogs: the older run lies in '{self.aside}' until this one ends", file=sys.stderr)
+        try:
+            yield
+        finally:
+            failed = not self.path.exists() or self._unclaimed()
+            shutil.rmtree(self.path if failed else self.aside, ignore_errors=True)
+            if failed:
+                self.aside.rename(self.path)
 
     @contextmanager
     def owned(self, new: bool = False) -> Iterator[None]:

@@ -47,8 +47,3 @@ class WallRecord:
         """The record of a run, or None where it has none. Raises `InputError` if the file is not one."""
         text = read_text(path)
         return None if text is None else build_dataclass(WallRecord, parse_json(text, f"'{path}'"), f"'{path}'")
-
-    def text(self) -> str:
-        """``trained 5.0 s, 9.1 s on the wall``."""
-        wall = "" if self.wall_seconds is None else f", {self.wall_seconds:.1f} s on the wall"
-        return f"trained {self.train_seconds:.1f} s{wall}"
