@@ -6,11 +6,8 @@ import ast
 import re
 from pathlib import Path
 
-import torch
-
 import turbogs_plugin
 from turbogs_plugin import strategies
-from turbogs_plugin.captures.demo import write_demo_capture
 from turbogs_plugin.strategies.protocols import Strategies
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -64,17 +61,3 @@ def test_what_type_checkers_see_of_a_package_is_what_it_has():
         block = Path(package.__file__).read_text(encoding="utf-8").split("if TYPE_CHECKING", 1)[1].split("\n\n", 1)[0]
         names = {name for name in re.findall(r"\b[A-Za-z_]\w*\b", re.sub(r"(?m)^.*?\bimport\b|#.*|\w+ as ", "", block))}
         assert {name for name in names if name != "from"} == set(package.__all__) & set(dir(package)) - {"__version__"}
-
-
-def test_readmes_three_lines(tmp_path):
-    """README's lines run as printed, on a smaller capture and for fewer iterations."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"```python\nimport turbogs_plugin\n\n(scene = .*?)```", readme, re.S)
-    assert len(block.strip().splitlines()) == 3
-    capture = write_demo_capture(tmp_path / "capture", views=8, width=48, height=40)
-    short = 'fit(scene, "train.iterations=2", "train.refine_until=1", "train.device=cpu", '
-    block = block.replace('"demo/capture"', repr(str(capture))).replace("fit(scene, ", short)
-    names = {"turbogs_plugin": turbogs_plugin}
-    exec(block, names)
-    assert names["image"].shape == (40, 48, 3) and bool(torch.isfinite(names["image"]).all())
-    assert float(names["image"].std()) > 0.01

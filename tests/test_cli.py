@@ -249,7 +249,12 @@ def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypa
     stop_after(monkeypatch, 3)
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *TINY)
     assert code == 130 and out == "" and f"turbogs train --resume {tmp_path / 'run'}" in err
-    assert (tmp_path / "run/checkpoints/iteration-000003.pt").is_file()
+    assert (tmp_path / "run/checkpoints/iteration-000003.pt").is_file() and "--trust" not in err
+    (tmp_path / "mine.py").write_text("from turbogs_plugin.strategies import RandomPixelSampler as Mine\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    words = ("--out", "own", "--device", "cpu", *TINY, "pixel_sampler.type=mine:Mine")
+    assert turbogs("train", capture, *words)[2].endswith("turbogs train --resume own --trust\n")
 
 
 def test_a_run_that_cannot_go_on_is_one_line_and_exit_code_1(turbogs, capture, tmp_path, monkeypatch):

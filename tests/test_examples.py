@@ -20,9 +20,7 @@ from helpers.framework_runs import thin_out_points
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene, write_demo_capture
-from turbogs_plugin.config.components import build
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.train import run
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.types import PixelSamples
@@ -137,19 +135,6 @@ def test_third_party_strategies_are_named_in_a_yaml(third_party, thin_capture, t
     assert history[-1].num_gaussians < history[0].num_gaussians
 
 
-def test_third_party_fields_are_checked_like_our_own(third_party):
-    with pytest.raises(InputError, match=r"field_sise.*field_size"):
-        build("pixel_sampler", {"type": "checkerboard", "field_sise": 2})
-    with pytest.raises(InputError, match="least_opacity"):
-        build("density", {"type": "opaque_only", "least_opacity": 2.0})
-
-
-def test_not_installed_it_is_not_known():
-    with pytest.raises(InputError, match=r"unknown pixel_sampler\.type 'checkerboard'"):
-        build("pixel_sampler", {"type": "checkerboard"})
-    assert importlib.util.find_spec("patchwork_strategies") is None
-
-
 def test_colmap_undistorts_to_the_capture_that_loading_makes(example, tmp_path):
     """A capture with random points alone keeps them, too."""
     folder = tmp_path / "raw"
@@ -195,8 +180,9 @@ def test_many_photos_are_a_capture_that_trains(example, tmp_path):
 
 
 def test_the_parts_that_the_page_prints_train(capture, tmp_path, monkeypatch):
-    """The parts of docs/python.md train, as objects and by name; the loss's gradient is its value's."""
-    page = (EXAMPLES.parent / "docs" / "python.md").read_text(encoding="utf-8")
+    """README's lines run, and docs/python.md's parts, as objects and by name; the loss's gradient is its value's."""
+    readme, page = ((EXAMPLES.parent / name).read_text(encoding="utf-8") for name in ("README.md", "docs/python.md"))
+    (lines,) = re.findall(r"^```python\n(.*?)^```$", readme, re.DOTALL | re.MULTILINE)
     first, code, second = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     (settings,) = re.findall(r"^```yaml\n([^`]*my_parts:Huber.*?)^```$", page, re.DOTALL | re.MULTILINE)
     (tmp_path / "my_parts.py").write_text(code)
@@ -204,8 +190,9 @@ def test_the_parts_that_the_page_prints_train(capture, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     names: dict = {}
-    for block in (first, second):
+    for block in (lines.replace('config="demo"', 'config="demo", iterations=2'), first, second):
         exec(block.replace("demo/capture", str(capture)).replace("iterations=200", "iterations=4"), names)
+        assert names["image"].shape == (24, 32, 3) and names["image"].std() > 0.01
     assert (tmp_path / "model.ply").is_file() and names["result"].history[-1].iteration == 4
     config = load_config("my.yaml", ["train.iterations=6", "train.device=cpu", f"scene.path={capture}"])
     assert run.train(config, tmp_path / "run").history[-1].psnr > 10

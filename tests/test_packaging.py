@@ -31,17 +31,36 @@ def modules() -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> list[str]:
-    """Names in a wheel built from what git tracks or would track."""
-    source = tmp_path_factory.mktemp("source") / "turbogs"
+def source(tmp_path_factory) -> Path:
+    """What git tracks or would track."""
     kept = ("build", "demo", "runs", "*.egg-info", "__pycache__", "*.so", ".*")
-    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(*kept))
+    folder = tmp_path_factory.mktemp("source") / "turbogs"
+    return Path(shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*kept)))
+
+
+def built(source: Path, target: Path, *command: str | Path) -> zipfile.ZipFile:
+    """The wheel that a command of Python writes to a folder."""
+    options = {"cwd": source, "env": os.environ | {"TURBOGS_CUDA": "off"}, "timeout": 300}
+    subprocess.run([sys.executable, *command], check=True, capture_output=True, **options)
+    return zipfile.ZipFile(next(target.glob("*.whl")))
+
+
+@pytest.fixture(scope="module")
+def wheel(source, tmp_path_factory) -> list[str]:
+    """Names in a wheel."""
     target = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", target, source]
-    environment = os.environ | {"TURBOGS_CUDA": "off"}
-    subprocess.run(command, check=True, capture_output=True, env=environment, timeout=300)
-    with zipfile.ZipFile(next(target.glob("*.whl"))) as archive:
+    command = ("-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", target, ".")
+    with built(source, target, *command) as archive:
         return archive.namelist()
+
+
+def test_type_checkers_see_an_editable_install(source, tmp_path):
+    """They follow a path in a .pth, and no hook of Python's import."""
+    code = f"from setuptools.build_meta import build_editable; build_editable({str(tmp_path)!r})"
+    with built(source, tmp_path, "-c", code) as archive:
+        (links,) = (name for name in archive.namelist() if name.endswith(".pth"))
+        assert archive.read(links).decode().splitlines() == [str(source)]
+    assert (source / "turbogs_plugin/py.typed").is_file()
 
 
 def test_the_wheel_holds_every_module_and_configuration_and_nothing_else(wheel):

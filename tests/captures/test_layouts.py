@@ -30,12 +30,6 @@ def pose_of(view: int) -> np.ndarray:
     return look_at(center, np.zeros(3), np.array([-0.05, 1.0, 0.0]))[:3]
 
 
-def seen_at(view: int, camera: pycolmap.Camera) -> np.ndarray:
-    """[3, 2] pixels of the points."""
-    pose = pose_of(view)
-    return camera.img_from_cam(POINTS @ pose[:, :3].T + pose[:, 3])
-
-
 def write_model(folder: Path, cameras: list[pycolmap.Camera], names: list[str], suffix: str = ".bin") -> None:
     """View i has camera ``i % len(cameras)``."""
     model = pycolmap.Reconstruction()
@@ -56,7 +50,9 @@ def write_photos(folder: Path, cameras: list[pycolmap.Camera], names: list[str],
     for view, name in enumerate(names):
         camera = cameras[view % len(cameras)]
         size = (round(camera.width / reduction), round(camera.height / reduction))
-        places = seen_at(view, camera) * np.divide(size, (camera.width, camera.height))
+        pose = pose_of(view)
+        seen = camera.img_from_cam(POINTS @ pose[:, :3].T + pose[:, 3])
+        places = seen * np.divide(size, (camera.width, camera.height))
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(painted_photo(size, places)).save(folder / name)
 

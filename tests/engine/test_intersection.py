@@ -12,12 +12,6 @@ from turbogs_plugin.engine.render_pass import RasterSettings
 SETTINGS = RasterSettings()
 
 
-def intersections_of(gaussians, cameras, samples):
-    rows = drawable_rows(gaussians, cameras, SETTINGS)
-    splats = project_rows(rows, rows.take(gaussians), cameras, 0, SETTINGS)
-    return rows, splats, intersect_tiles(rows, splats, samples, SETTINGS)
-
-
 def contributing(rows, splats, samples, tile: int) -> torch.Tensor:
     """[R] bool by brute force: alpha reaches the threshold at some pixel of the tile."""
     grid, tile_id = samples.grid, int(samples.tile_ids[tile])
@@ -47,7 +41,9 @@ def test_no_contribution_is_lost_and_order_is_by_depth(dtype, shape, origin):
         gaussians.scales[:, 1:] -= 5
     cameras = make_cameras([(70, 45), (33, 64)], dtype)
     samples = thin_out(dense_on_grid(cameras.sizes, origin), 0.2)
-    rows, splats, intersections = intersections_of(gaussians, cameras, samples)
+    rows = drawable_rows(gaussians, cameras, SETTINGS)
+    splats = project_rows(rows, rows.take(gaussians), cameras, 0, SETTINGS)
+    intersections = intersect_tiles(rows, splats, samples, SETTINGS)
     assert len(samples.tile_ids) < len(samples.grid)
     found, needed = 0, 0
     for tile, listed in enumerate(intersections.rows.split(intersections.tile_counts.tolist())):

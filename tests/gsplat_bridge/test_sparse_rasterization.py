@@ -24,15 +24,11 @@ GSPLAT_KEYS = {
 }
 
 
-def sparse_samples(cameras, rate=0.2):
-    maps = ErrorMaps(cameras.sizes, "cpu")
-    return RandomPixelSampler().sample(maps, tuple(range(len(cameras))), rate, Step(3, 10, 10))
-
-
 @pytest.fixture
 def scene():
     cameras = make_cameras(2)
-    return make_splats(), cameras, sparse_samples(cameras)
+    samples = RandomPixelSampler().sample(ErrorMaps(cameras.sizes, "cpu"), (0, 1), 0.2, Step(3, 10, 10))
+    return make_splats(), cameras, samples
 
 
 @pytest.mark.parametrize("render_mode", ["ED", "RGB+ED"])

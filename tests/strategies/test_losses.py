@@ -23,7 +23,6 @@ SSIM_SLOPE = 8 * 2 / 0.03 + 1 / 0.01
 """The most that h of `window_similarity` can be in exact arithmetic. A window gives a pixel at most 2 sqrt(share / c2)
 of its contrast-structure term, and the sum of the roots of a pixel's shares in all whole windows is 7.5; the luminance
 term's slope is at most 1 / sqrt(c1)."""
-STRUCTURED = [loss for loss in EVERY if isinstance(loss, CharbonnierNccLoss)]
 
 
 def make_samples(counts, empty=(), weights=None):
