@@ -47,9 +47,11 @@ class ViewSampler(Protocol):
     def select(self, count: int, view_errors: np.ndarray, step: Step) -> tuple[int, ...]:
         """`count` distinct view numbers. `view_errors`: [V] float64, mean error of each view."""
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint keeps: tensors and plain values."""
 
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Load what `state_dict` gave, after `setup`; `ValueError` where it does not fit."""
 
 
 @runtime_checkable
@@ -137,10 +139,11 @@ class DensityController(Protocol):
         return
 
     def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint keeps: tensors and plain values."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load what `state_dict` gave."""
+        """Load what `state_dict` gave, after `setup`; `ValueError` where it does not fit."""
         return
 
 
@@ -184,10 +187,11 @@ class GaussianOptimizer(Protocol):
         return
 
     def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint keeps: tensors and plain values."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load what `state_dict` gave."""
+        """Load what `state_dict` gave, after `setup`; `ValueError` where it does not fit."""
         return
 
 

@@ -108,5 +108,6 @@ class FixedSchedule:
         require_positive(self, "pixel_budget")
 
     def query(self, step: Step, mean_error: float, initial_error: float, num_views: int) -> SamplingBudget:
+        """As of `SinusoidalSchedule.query`; the errors change nothing."""
         views = min(self.views, num_views)
         return SamplingBudget(views, min(1.0, self.pixel_budget / views))

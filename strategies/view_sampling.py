@@ -57,10 +57,11 @@ class RandomViewSampler:
     num_views: int = field(init=False, repr=False)  # V
 
     def setup(self, cameras: Cameras, scene_extent: float) -> None:
+        """Begin with an empty stack for the V training cameras."""
         self.stack, self.num_views = np.zeros(0, dtype=np.int64), len(cameras)
 
     def select(self, count: int, view_errors: np.ndarray, step: Step) -> tuple[int, ...]:
-        """`count` distinct views, or all V where `count` is more."""
+        """`count` distinct views, or all V where `count` is more. `view_errors`: [V] float64, by which some wait."""
         count = self._fill(count, step, view_errors if step.progress >= DOUBTED_FROM else None)
         taken, self.stack = self.stack[:count], self.stack[count:]
         return tuple(taken.tolist())
@@ -85,7 +86,7 @@ class RandomViewSampler:
         return {"stack": torch.from_numpy(self.stack.copy())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load a saved stack. ValueError if it does not hold distinct views of this scene."""
+        """Load a saved stack. Raises `ValueError` if it does not hold distinct views of this scene."""
         views = state["stack"].cpu().numpy().copy()
         if len(np.unique(views)) != len(views) or not np.isin(views, np.arange(self.num_views)).all():
             raise ValueError(f"the saved stack does not hold distinct ones of {self.num_views} views")

@@ -57,6 +57,7 @@ class TurboDensityStrategy(DefaultStrategy):
         absgrad: also densify by absolute gradients above grow_absgrad2d; render with ``absgrad=True`` then.
         grow_grad2d, grow_absgrad2d, grow_scale3d: grad_threshold, absgrad_threshold and percent_dense of
             `ErrorDrivenDensity`.
+        top_fraction, prune_score_fraction, opacity_decay: as of `ErrorDrivenDensity`.
         max_gaussians: never more, at any step.
     """
 
@@ -91,7 +92,7 @@ class TurboDensityStrategy(DefaultStrategy):
     def step_pre_backward(
         self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any]
     ) -> None:
-        """To be called before ``loss.backward()``."""
+        """To be called before ``loss.backward()``. Raises `InputError`: `info` lacks ``means2d`` with a gradient."""
         require_one_process("TurboDensityStrategy")
         require_keys(info, ("means2d",), "info", "pass what the rasterization returned")
         if not info["means2d"].requires_grad:

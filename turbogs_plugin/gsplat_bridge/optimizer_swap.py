@@ -72,7 +72,7 @@ class SharedOptimizer:
         return member
 
     def hand_over(self, name: str, gradient: Tensor | None) -> None:
-        """Take a member's gradient; the last one to come carries out the update of all parameters.
+        """Take a member's gradient [N, ...]; the last one to come carries out the update of all parameters.
 
         A `GradScaler` leaves out each optimizer whose gradient has an inf: an iteration that lacks a member is skipped
         whole, as soon as the next one begins. Raises `InputError` after `MOST_SKIPPED` of them, and more than were

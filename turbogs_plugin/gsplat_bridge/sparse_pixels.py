@@ -61,7 +61,7 @@ def maps_of_photos(
 
 def gather_pixels(images: Tensor, samples: PixelSamples) -> Tensor:
     """[P, D] the pixels of images [C, H, W, D], one for each of the samples' views in their order; zero in empty slots.
-    Differentiable."""
+    Differentiable. Raises `InputError` for images of another shape."""
     check_samples(samples)
     shape = tuple(images.shape) if isinstance(images, Tensor) else type(images).__name__
     expected = [(int(height), int(width)) for width, height in samples.sizes]

@@ -81,7 +81,7 @@ class GaussianGradients(ParameterTensors):
     touched: Tensor
 
     def summed(self, name: str) -> Tensor:
-        """The gradient of one parameter in its own shape, summed over views."""
+        """[N, ...], the gradient of one parameter in its own shape, summed over views."""
         value = getattr(self, name)
         return value if name == "shN" else value.sum(dim=0)
 
