@@ -6,7 +6,7 @@ from gsplat_host import Options, command_line, report, train
 from sparse_pixels import SparseForward
 
 from turbogs_plugin.gsplat_bridge import SharedOptimizer, TurboDensityStrategy, sparse_budget
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
+from turbogs_plugin.strategies import MomentLMOptimizer
 
 
 def main(options: Options) -> None:

@@ -25,7 +25,7 @@ from turbogs_plugin.engine import render
 from turbogs_plugin.gsplat_bridge import sparse_rasterization
 from turbogs_plugin.model.initial import gaussians_from_points
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.types import Cameras, Gaussians
+from turbogs_plugin.strategies import Cameras, Gaussians
 
 LEARNING_RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
 SH_DEGREE = 3

@@ -7,8 +7,7 @@ from gsplat import DefaultStrategy
 from gsplat_host import Options, command_line, report, train
 
 from turbogs_plugin.gsplat_bridge import SharedOptimizer
-from turbogs_plugin.strategies.optimizers.moment_lm import MomentLMOptimizer
-from turbogs_plugin.strategies.optimizers.sparse_adam import SparseAdam
+from turbogs_plugin.strategies import MomentLMOptimizer, SparseAdam
 
 
 def main(options: Options) -> None:

@@ -10,17 +10,23 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.gsplat_bridge import gather_pixels
 from turbogs_plugin.report.provenance import provenance
-from turbogs_plugin.strategies import SparseLoss
-from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
-from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
-from turbogs_plugin.strategies.protocols import PixelSampler
-from turbogs_plugin.types import PixelSamples, Step
+from turbogs_plugin.strategies import (
+    CharbonnierLoss,
+    CharbonnierNccLoss,
+    DensePixelSampler,
+    ErrorGuidedPixelSampler,
+    ErrorMaps,
+    PixelSampler,
+    PixelSamples,
+    RandomPixelSampler,
+    SparseLoss,
+    Step,
+)
 
 
 class ImageNetwork(torch.nn.Module):
@@ -64,6 +70,9 @@ class Variant:
     sampler: PixelSampler
     loss: SparseLoss
 
+
+BAR = 38
+"""Pixels of the bar of titles above a figure."""
 
 VARIANTS = (
     Variant("random pixels, Charbonnier", RandomPixelSampler(), CharbonnierLoss()),
@@ -158,18 +167,19 @@ def draw_figure(path: Path, photo: Tensor, learnt: list[Tensor]) -> None:
     errors = [(4.0 * (image - photo).abs().mean(dim=-1, keepdim=True)).clamp(0, 1).expand_as(photo) for image in learnt]
     titles = [
         "photo",
-        *(f"{variant.name}: {psnr(image, photo):.2f} dB" for variant, image in zip(VARIANTS, learnt, strict=True)),
+        *(f"{variant.name}:\n{psnr(image, photo):.2f} dB" for variant, image in zip(VARIANTS, learnt, strict=True)),
     ]
     blank = torch.ones_like(photo)
     rows = [torch.cat(row, dim=1) for row in ([photo, *learnt], [blank, *errors])]  # [H, 3 * W, 3] each
     pixels = Image.fromarray((255.0 * torch.cat(rows)).round().byte().numpy())
     width, height = 2 * photo.shape[1], 2 * photo.shape[0]  # of a panel, shown double
-    figure = Image.new("RGB", (3 * width, 2 * height + 14), "white")
-    figure.paste(pixels.resize((3 * width, 2 * height), Image.Resampling.NEAREST), (0, 14))
-    pen = ImageDraw.Draw(figure)
+    figure = Image.new("RGB", (3 * width, 2 * height + BAR), "white")
+    figure.paste(pixels.resize((3 * width, 2 * height), Image.Resampling.NEAREST), (0, BAR))
+    pen, font = ImageDraw.Draw(figure), ImageFont.load_default(size=14)
     for column, title in enumerate(titles):
-        pen.text((column * width + 2, 1), title, fill="black")
-    pen.text((2, 14 + height + 2), "errors, x 4", fill="black")
+        pen.text((column * width + 4, 1), title, fill="black", font=font)
+    said = "The errors of what was learnt:\nblack is none, white is 1/4 and more."
+    pen.text((width - 4, BAR + height + 4), said, fill="black", font=font, anchor="ra", align="right")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.save(path, optimize=True)
 

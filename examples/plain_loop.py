@@ -9,10 +9,15 @@ import tyro
 
 from turbogs_plugin import load_scene, rasterize, render_image
 from turbogs_plugin.captures import write_demo_capture
-from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.model.initial import gaussians_from_points
-from turbogs_plugin.strategies import CharbonnierNccLoss, ErrorDrivenDensity, ErrorGuidedPixelSampler, MomentLMOptimizer
-from turbogs_plugin.types import Step
+from turbogs_plugin.strategies import (
+    CharbonnierNccLoss,
+    ErrorDrivenDensity,
+    ErrorGuidedPixelSampler,
+    ErrorMaps,
+    MomentLMOptimizer,
+    Step,
+)
 
 
 def main(path: str = "", iterations: int = 200, views: int = 4) -> float:

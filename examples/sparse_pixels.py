@@ -11,9 +11,7 @@ from torch import Tensor
 
 from turbogs_plugin.gsplat_bridge import gather_pixels, maps_of_photos, sparse_budget, sparse_loss, sparse_rasterization
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.strategies.losses import CharbonnierNccLoss
-from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
-from turbogs_plugin.types import Step
+from turbogs_plugin.strategies import CharbonnierNccLoss, ErrorGuidedPixelSampler, Step
 
 
 class SparseForward:

@@ -85,7 +85,7 @@ def test_pixels_on_an_mlp(example, tmp_path, capsys):
         printed.append(values)
     assert all(after > before + 3 for before, after in zip(*printed, strict=True))
     with Image.open(figure) as drawn:
-        assert drawn.size == (3 * 2 * 48, 2 * 2 * 32 + 14)
+        assert drawn.size == (3 * 2 * 48, 2 * 2 * 32 + script.BAR)
     script.record(results, "another", [[20.0, 21.0], [22.0, 24.0]])
     first, second = json.loads(results.read_text()).items()
     assert first[0].endswith("/photo.png") and [len(column) for column in first[1]["psnr"].values()] == [1, 1]

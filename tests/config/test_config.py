@@ -78,6 +78,7 @@ BAD_OVERRIDES = {
     "density.split=middle": "density.split.*sample.*long_axis",
     "budget.time=1000000h": "time.*at most 100h",
     "train..seed=1": "section.key=value",
+    "demo": r"write --config demo \(in Python, config='demo'\)",
     "train.device=tpu": "device.*tpu.*cuda",
 }
 

@@ -387,7 +387,7 @@ def test_fit_takes_a_mapping_and_a_callback_and_names_what_it_does_not_know(capt
     assert seen == result.history and (result.config.train.iterations, result.config.train.refine_until) == (4, 2)
     shown = r"Fit of Scene 'capture': 7 \+ 1 views of 40x24, 73 points: 73 Gaussians of SH degree 3 on cpu, .* dB .* s"
     assert re.fullmatch(shown, repr(result)) and repr(result.scene.test.cameras) == "1 cameras of 40x24"
-    with pytest.raises(InputError, match="unknown kind of strategy 'sampler': did you mean"):
+    with pytest.raises(InputError, match="fit: there is no 'sampler': did you mean"):
         fit(capture, sampler=None)
     with pytest.raises(InputError, match=r"loss=CharbonnierLoss is a class: give an object, CharbonnierLoss\(\.\.\.\)"):
         fit(capture, loss=CharbonnierLoss)

@@ -178,6 +178,7 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         keys = path.strip().split(".")
         if not separator or len(keys) < 2 or not all(keys):
             meant = " or ".join(f"{name}={text or 'VALUE'}" for name in settings_named(path.strip()))
+            meant = f"--config {path} (in Python, config='{path}')" if path in config_names() else meant
             hint = f": write {meant}" if meant else ""
             raise InputError(f"override '{override}' is not of the form section.key=value{hint}")
         if not text.strip():

@@ -137,7 +137,8 @@ def fit(
     """
     for kind, strategy in strategies.items():
         if kind not in KINDS:
-            raise InputError(f"fit: unknown kind of strategy '{kind}': {nearest(kind, KINDS)}")
+            known = (*KINDS, "callback", "config", "iterations", "progress")
+            raise InputError(f"fit: there is no '{kind}': {nearest(kind, known)}")
         if isinstance(strategy, type):
             raise InputError(f"fit: {kind}={strategy.__name__} is a class: give an object, {strategy.__name__}(...)")
     settings = load_config(config if isinstance(config, Mapping) else str(config), overrides)

@@ -6,10 +6,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import require
-from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler
-from turbogs_plugin.types import PixelSamples, Step
+from turbogs_plugin.strategies import DensePixelSampler, ErrorMaps, PixelSamples, Step
 
 
 @dataclass

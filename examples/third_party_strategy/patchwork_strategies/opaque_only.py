@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from turbogs_plugin.errors import require
-from turbogs_plugin.strategies.protocols import DensityController
-from turbogs_plugin.types import Gaussians, RowUpdate, Step
+from turbogs_plugin.strategies import DensityController, Gaussians, RowUpdate, Step
 
 
 @dataclass
