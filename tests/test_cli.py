@@ -252,7 +252,6 @@ def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypa
     assert (tmp_path / "run/checkpoints/iteration-000003.pt").is_file() and "--trust" not in err
     (tmp_path / "mine.py").write_text("from turbogs_plugin.strategies import RandomPixelSampler as Mine\n")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delitem(sys.modules, "mine", raising=False)
     words = ("--out", "own", "--device", "cpu", *TINY, "pixel_sampler.type=mine:Mine")
     assert turbogs("train", capture, *words)[2].endswith("turbogs train --resume own --trust\n")
 

@@ -23,6 +23,7 @@ def test_a_run_records_the_wall_until_its_model_and_the_parts_of_its_report(capt
     save, wall = sessions.save_ply, WallClock()
     monkeypatch.setattr(sessions, "save_ply", lambda *model: (clock.passes(10.0), save(*model)))
     clock.passes(1000.0)
+    wall.mark("interpreter and imports")
     report = lambda session: (clock.passes(100.0), write_report(session))  # noqa: E731
     session = run.train(tiny_config(capture), tmp_path / "run", report, wall)
     record = WallRecord.read(session.folder.wall)

@@ -81,6 +81,7 @@ def train(
         if resume is None:
             folder.require_new()
         return start(gpus, sys.argv[1:], settings.train.device)
+    clock.mark("interpreter and imports")
     page, watch = write_report if report else None, []
     with joined(settings.train.device) as ranks, ExitStack() as pages:
         live = None

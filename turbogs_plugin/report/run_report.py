@@ -72,13 +72,12 @@ def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int, doub
     on += [f"LPIPS was not computed: {lpips_reason}."] if lpips_reason else []
     grey = "; masked pixels of photo and error are grey" if masked else ""
     heads = ("training in s", "wall in s", "Gaussians", "FPS", "peak memory in MiB")
-    wall = run.wall.wall_seconds
     rows = []
     for of in run.history:
         errors = (number(value, digits) for value, digits in ((of.psnr, 2), (of.ssim, 4), (of.l1, 4)))
         rows.append([of.iteration, f"{of.train_seconds:.1f}", *errors, of.num_gaussians, of.memory_bytes // 2**20])
     seconds, *_, count, memory = rows[-1][1:]
-    whole = "not recorded" if wall is None else f"{wall:.1f}"
+    whole = number(run.wall.wall_seconds or float("nan"), 1, "not recorded")
     cost = table(heads, [[seconds, whole, count, f"{metrics.fps:.1f}", memory]])
     history = table(("iteration", "training in s", *ERRORS.values(), "Gaussians", "peak memory in MiB"), rows)
     strips = "\n\n".join(

@@ -44,9 +44,6 @@ from turbogs_plugin.types import Gaussians
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-IMPORTS = "interpreter and imports"
-"""The first part of the wall time."""
-
 
 def plan_run(config: Config, processes: int = 1) -> Plan:
     """The plan that `train` would make now, with this number of processes. The capture's notes are printed."""
@@ -185,7 +182,6 @@ def train(
         TrainingStopped: the run cannot go on; the files that it saved stay.
     """
     clock = clock or WallClock()
-    clock.mark(IMPORTS)
     folder = RunFolder(out)
     require_device(config.train.device)
     if ranks.first:
@@ -238,7 +234,6 @@ def resume(
         TrainingStopped: the run cannot go on.
     """
     clock = clock or WallClock()
-    clock.mark(IMPORTS)
     folder = RunFolder(path)
     config = folder.read_config(True, trusted)
     require_device(config.train.device)

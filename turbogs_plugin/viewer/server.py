@@ -86,7 +86,8 @@ class Page:
         self.url = f"http://{host}:{self.server.get_port()}"
         gui: Any = self.server.gui  # its handles' values cannot be set, says its type
         self._status = gui.add_markdown("Photos are being read, and error maps made.")
-        self._pictures = gui.add_dropdown("Picture", [picture.value for picture in Picture])
+        offered = Picture if training else (Picture.RENDER, Picture.COMPARE)  # the others are of a training
+        self._pictures = gui.add_dropdown("Picture", [picture.value for picture in offered])
         self._slider = gui.add_slider("View", 1, 2, 1, 1, visible=False)  # from 1, as the line about a view counts
         self._there = gui.add_button("Stand at this view", visible=False)
         self.training = gui.add_folder("Training", visible=training)
@@ -209,7 +210,11 @@ def _guarded(host: str) -> Iterator[None]:
             own = len(hosts) == 1 and _own_name(hosts[0], host)
             if not own or any(urlsplit(origin).netloc != hosts[0] for origin in origins):
                 return connection.respond(403, "This page answers to localhost and its --host alone.\n")
-            return process_request(connection, request)
+            request.headers.pop("Accept-Encoding", None)  # or the page comes packed
+            page = process_request(connection, request)
+            if page is not None and page.body:  # viser has no setting for the tab's name; the page's length stays
+                page.body = page.body.replace(b"  <title>Viser<", b"<title>TurboGS<", 1)
+            return page
 
         guarded.append(host)
         return serve(*arguments, process_request=answer, **options)
