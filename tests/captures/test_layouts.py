@@ -72,17 +72,16 @@ NAMES = [f"_DSC{8670 + view}.png" for view in range(VIEWS)]
 
 @pytest.mark.parametrize("kept", [(1, 2, 4, 8), (4, 8), (8,)])
 def test_mip_nerf_360(tmp_path, kept):
-    """images, images_2, ... beside sparse/0 and poses_bounds.npy; those of full size, which take 10 GB, often gone."""
+    """images, images_2, ... beside sparse/0; those of full size, which take 10 GB, often gone."""
     camera = [pinhole(240, 160, 200.0)]
     write_model(tmp_path / "garden/sparse/0", camera, NAMES)
     for reduction in kept:
         write_photos(tmp_path / f"garden/images_{reduction}".removesuffix("_1"), camera, NAMES, reduction)
-    np.save(tmp_path / "garden/poses_bounds.npy", np.zeros((VIEWS, 17)))
     for factor in {kept[0], 1}:
         scene = load_scene(tmp_path / "garden", factor)
         require_painted(scene)
         assert scene.train.cameras.sizes[0].tolist() == [240 // kept[0], 160 // kept[0]]
-    assert "sparse/0 (binary): 9 images, 3 points" in scene.notes[0] and "poses_bounds.npy not used" in scene.notes
+    assert "sparse/0 (binary): 9 images, 3 points" in scene.notes[0]
     if kept[0] > 1:
         assert f"intrinsics rescaled from 240x160 to {240 // kept[0]}x{160 // kept[0]}" in " ".join(scene.notes)
     if kept == (4, 8):
@@ -167,6 +166,10 @@ def test_one_camera_a_photo_upright_and_lying(tmp_path, kind):
     ("files", "words"),
     [
         (["opensfm/reconstruction.json"], "reconstruction.json is not read, .* of OpenSfM or ODM: ns-process-data"),
+        (["poses_bounds.npy"], "poses_bounds.npy is not read, .* of LLFF: take the sparse/0"),
+        (["transforms_colmap.json"], "colmap.json is not read, .* of nerfstudio: name it transforms.json, or give the"),
+        (["scene/transforms.json"], "scene/transforms.json is not read, .* give the folder that it lies in"),
+        (["sensors/trajectories.txt"], "trajectories.txt is not read, .* of Kapture"),
         (["cameras.xml"], "cameras.xml is not read, .* of Metashape"),
         (["corrected_cameras/1.json"], "1.json is not read, .* of Polycam"),
         (["images/1.xmp"], "1.xmp is not read, .* of RealityScan"),

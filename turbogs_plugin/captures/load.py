@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from turbogs_plugin.captures import llff, transforms
+from turbogs_plugin.captures import transforms
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture
 from turbogs_plugin.captures.colmap import find_model, read_colmap
 from turbogs_plugin.captures.decoding import ALWAYS_PIXELS, channels_of, load_photos, photo_sizes, reduced_sizes
@@ -33,7 +33,6 @@ from turbogs_plugin.types import Cameras
 READERS: dict[str, Callable[[Path], Capture]] = {
     transforms.FILE: transforms.read_transforms,
     transforms.TRAIN_FILE: transforms.read_blender,
-    llff.FILE: llff.read_llff,
 }
 """Readers of files of cameras that are not COLMAP's, in the order in which they are taken."""
 OTHER_POSES = {
@@ -46,6 +45,9 @@ OTHER_POSES = {
     "openMVG or Meshroom: openMVG_main_openMVG2Colmap, or export as COLMAP": "sfm_data* *.sfm",
     "Polycam: ns-process-data polycam": "*cameras/*.json keyframes/*cameras mesh_info.json",
     "Record3D: ns-process-data record3d": "metadata.json EXR_RGBD",
+    "LLFF: take the sparse/0 that it was made from": "poses_bounds.npy",
+    "nerfstudio: name it transforms.json, or give the folder that it lies in": "transforms*.json */transforms*.json",
+    "Kapture: kapture_export_colmap.py": "sensors/trajectories.txt",
     "the capture of a model: use that capture": "cameras.json",
 }
 """Files that may have cameras and are not read, by what writes them and the way from there to a capture."""
@@ -73,8 +75,7 @@ def load_scene(
 
     Args:
         path: the scene's folder. Where it could be of several kinds, the first of these is taken: a COLMAP
-            reconstruction (`find_model`), ``transforms.json``, NeRF-synthetic's ``transforms_train.json``, LLFF's
-            ``poses_bounds.npy``.
+            reconstruction (`find_model`), ``transforms.json``, NeRF-synthetic's ``transforms_train.json``.
         factor: photos and intrinsics are reduced by this. Copies in ``images_<factor>`` are used where all are there
             in the right size; otherwise ``images`` are reduced by area averaging.
         test_every: the first of each `test_every` photos in name order is a test view, the others are for training.

@@ -38,8 +38,8 @@ def train(
     """Train on a capture, or go on with a stopped run.
 
     Args:
-        scene: folder of a capture: a COLMAP reconstruction, a transforms.json, NeRF-synthetic or LLFF, with its photos;
-            or of photos alone, whose cameras are found first (see reconstruct).
+        scene: folder of a capture: a COLMAP reconstruction, a transforms.json or NeRF-synthetic, with its photos; or
+            of photos alone, whose cameras are found first (see reconstruct).
         overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none; turbogs plan without a
             SCENE lists all settings.
         out: new folder for the run.
