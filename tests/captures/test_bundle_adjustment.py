@@ -14,7 +14,7 @@ from turbogs_plugin.captures.bundle_adjustment import (
     refine_together,
     reprojection_errors,
 )
-from turbogs_plugin.scene.geometry import Observations
+from turbogs_plugin.types.cameras import Observations
 
 
 def same(first: Pinholes, second: Pinholes, view: int | slice = slice(None)) -> bool:

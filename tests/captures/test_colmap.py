@@ -144,6 +144,17 @@ def test_of_several_models_the_largest_is_taken_and_said(tmp_path):
     assert re.fullmatch("COLMAP reconstruction .*sparse/1 .binary.: 9 images, 20 points", scene.notes[0])
 
 
+def test_files_in_binary_and_in_text_make_one_model(tmp_path):
+    folder = write_capture(tmp_path / "cup")
+    whole, model = load_scene(folder), folder / "sparse/0"
+    pycolmap.Reconstruction(model).write_text(model)
+    for name in ("cameras.bin", "images.txt", "points3D.bin", "frames.txt", "rigs.txt"):
+        (model / name).unlink()
+    scene = load_scene(folder)
+    assert torch.equal(scene.train.cameras.viewmats, whole.train.cameras.viewmats)
+    assert "(binary and text): 9 images, 20 points" in scene.notes[0] and len(scene.points) == 20
+
+
 def test_copies_that_the_cameras_were_reconstructed_from(tmp_path):
     """Nothing of full size is there, neither photos nor cameras: factors count from the copies."""
     folder = write_capture(tmp_path / "cup")

@@ -17,10 +17,10 @@ from turbogs_plugin.engine.render_pass import RenderOptions
 from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.depths import CELL, DepthPair, InverseDepths
-from turbogs_plugin.scene.geometry import Observations
 from turbogs_plugin.strategies.losses import EPSILON, CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
 from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import PARAMETER_NAMES
+from turbogs_plugin.types.cameras import Observations
 
 TERMS = LossTerms(EPSILON, depth_weight=0.7)
 CAMERAS = make_cameras([(21, 18), (33, 16)])

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from turbogs_plugin.captures.bundle_adjustment import Pinholes
-from turbogs_plugin.scene.geometry import Observations
+from turbogs_plugin.types.cameras import Observations
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 560.0
 

@@ -78,8 +78,10 @@ def test_load_leaves_out_rows_that_are_not_finite_and_refuses_a_model_without_an
     with pytest.warns(UserWarning, match=r"a\.ply: 2 of 20 Gaussians are not finite and left out"):
         assert len(load_ply(written(tmp_path / "a.ply", columns))) == 18
     activated = {name: np.linspace(0.1, 0.9, 100) for name in columns}
+    logits = np.linspace(-6.0, 9.0, 100)
     columns["rot_3"][:] = np.nan
-    for case, words in ((columns, "none of its 20 Gaussians is finite"), (activated, "logits")):
+    sizes = activated | {f"scale_{axis}": np.geomspace(1e-4, 2.0, 100) for axis in range(3)} | {"opacity": logits}
+    for case, words in ((columns, "none of its 20 Gaussians is finite"), (activated, "logits"), (sizes, "logarithms")):
         with pytest.raises(InputError, match=words):
             load_ply(written(tmp_path / "a.ply", case))
     with pytest.raises(InputError, match=r"cannot read .*absent\.ply"):

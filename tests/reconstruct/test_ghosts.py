@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from turbogs_plugin.captures.matches import epipolar_distances
 from turbogs_plugin.reconstruct.ghosts import Agreement, consistent_groups, ghost_pairs
-from turbogs_plugin.reconstruct.solver import epipolar_distances
 
 
 def walk(count: int, reach: int, ghosts: range = range(0), repeated: int = 60) -> Agreement:

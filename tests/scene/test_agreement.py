@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from turbogs_plugin.captures import load_scene, write_demo_capture
+from turbogs_plugin.captures.load import unseeing_note
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.agreement import LEAST_LIKENESS, OTHER_AXES, likeness, require_agreement, unseeing_note
+from turbogs_plugin.scene.agreement import LEAST_LIKENESS, OTHER_AXES, likely_poses, likeness, require_agreement
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.types import Cameras
 
@@ -53,6 +54,18 @@ def foreign(scene: Scene, doubt: str = "") -> Scene:
     return replace(scene, point_colors=scene.point_colors.flip(0), doubt=doubt)
 
 
+def mistaken(scene: Scene, place: int) -> Scene:
+    """The scene with one of its likely mistakes."""
+    likely = [*likely_poses(scene.frame.restore_poses(scene.train.cameras.viewmats.double().numpy()))]
+    return posed(scene, scene.frame.normalise_poses(likely[place][0]))
+
+
+def off_center(scene: Scene, *middle: float) -> Scene:
+    """The scene with its principal points at these shares of the photos' width and height."""
+    (other := posed(scene, scene.train.cameras.viewmats.clone())).train.cameras.Ks[:, :2, 2] = torch.tensor(middle) * 64
+    return other
+
+
 CONTRADICTIONS = {
     "other axes": (lambda s: posed(s, OTHER_AXES @ s.train.cameras.viewmats.double().numpy()), "columns 2 and 3"),
     "inverse poses": (inverted, "invert each pose"),
@@ -66,6 +79,11 @@ CONTRADICTIONS = {
     "stale frames": (lambda s: foreign(s, "poses of frames"), "poses of frames"),
     "points far away": (lambda s: replace(s, points=s.points + 100.0), "cameras see no points: .*one frame"),
     "intrinsics in shares": (shares, "in pixels"),
+    "x, y, z, w in images.txt": (lambda s: mistaken(s, 4), "reorder the quaternions"),
+    "x, y, z, w of camera to world": (lambda s: mistaken(s, 5), "reorder the quaternions"),
+    "w, x, y, z for x, y, z, w": (lambda s: mistaken(s, 9), "reorder the quaternions"),
+    "principal points from the middle": (lambda s: off_center(s, 0.01, -0.01), "principal points are at 0.01, "),
+    "intrinsics of twice the size": (lambda s: off_center(s, 1.0, 0.75), "write the photos' size"),
     "no alpha": (lambda s: even(s, 0, 0, 0, 0), "alpha 0"),
 }
 

@@ -27,9 +27,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.scene.geometry import Observations
 from turbogs_plugin.scene.scene import Scene
 from turbogs_plugin.types import Cameras
+from turbogs_plugin.types.cameras import Observations
 
 ROUNDS, CAMERA_STEPS, RESECTION_STEPS = 6, 2, 10
 PRIOR = 0.006

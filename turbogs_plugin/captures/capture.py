@@ -12,7 +12,7 @@ import numpy as np
 
 from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.geometry import Observations
+from turbogs_plugin.types.cameras import Observations
 
 FEWEST_PHOTOS = 3  # fewest photos of a capture
 LONGEST_NAME = 4096  # most letters of a photo's name

@@ -19,7 +19,7 @@ from turbogs_plugin.captures.photo_files import IMAGES, find_named
 from turbogs_plugin.captures.starting_points import clouds_beside
 from turbogs_plugin.captures.undistort import Lens, lens_of_camera
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.geometry import Observations
+from turbogs_plugin.types.cameras import Observations
 
 if TYPE_CHECKING:
     import pycolmap
@@ -45,15 +45,11 @@ def find_model(scene: Path) -> tuple[Path, str] | None:
     Of the several that COLMAP writes where photos did not connect (``sparse/0``, ``sparse/1``, ...), the one with the
     largest file of images is taken. One that lacks files is taken where no other one is whole: `read_model` names them.
     """
-
-    def bytes_of_images(model: tuple[Path, str]) -> int:
-        file = model[0] / f"images{model[1]}"
-        return file.stat().st_size if file.is_file() else 0
-
     for needed in (FILES, FILES[:1], FILES[1:2]):
         for name in MODEL_FOLDERS:
             if models := _models_in(scene / name, needed):
-                return max(models, key=bytes_of_images)  # first of equals
+                sizes = [sum(file.stat().st_size for file in place.glob(f"images{end}")) for place, end in models]
+                return models[sizes.index(max(sizes))]
     return None
 
 
@@ -80,7 +76,8 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     Ks = [camera.calibration_matrix() if lens is None else lens.K for camera, lens in pairs]
     sizes = [(camera.width, camera.height) if lens is None else lens.size for camera, lens in pairs]
     where = "" if found.folder == scene / IMAGES else f", photos in {found.folder}"
-    kind = "binary" if suffix == ".bin" else "text"
+    mixed = any(not (folder / f"{file}{suffix}").is_file() for file in FILES[:2])
+    kind = "binary and text" if mixed else "binary" if suffix == ".bin" else "text"
     cloud = folder / CLOUD if len(model.points) and model.points["id"][0] >= colmap_files.FIRST_OF_CLOUD else None
     test, split = _own_split(scene, folder, found.names)
     beside = [other for other, _ in _models_in(folder.parent, FILES)]

@@ -60,9 +60,10 @@ class ColmapModel(NamedTuple):
 
 
 def read_model(folder: Path, suffix: str) -> ColmapModel:
-    """The reconstruction in a folder, of files with a suffix. Raises `InputError` where a file is damaged, or an image
-    has a camera that is not there; the line names file and place."""
-    cameras, images, points = (folder / f"{file}{suffix}" for file in FILES)
+    """The reconstruction in a folder, of files with a suffix, or with the other one where a file has that alone. Raises
+    `InputError` where a file is damaged, or an image has a camera that is not there; the line names file and place."""
+    given = {file: [folder / f"{file}{end}" for end in (suffix, *SUFFIXES)] for file in FILES}
+    cameras, images, points = (next(filter(Path.is_file, paths), paths[0]) for paths in given.values())
     points = points if points.is_file() or not (folder / CLOUD).is_file() else folder / CLOUD
     if absent := [path.name for path in (cameras, images, points) if not path.is_file()]:
         remedy = "bring back what is missing, or take that folder away and find the cameras by 'turbogs reconstruct'"
@@ -77,7 +78,7 @@ def read_model(folder: Path, suffix: str) -> ColmapModel:
             raise _damaged(images, f"image {number} has camera {camera}, which {cameras.name} does not have")
         name, features = record.name(), record.features()
         known_images[number] = ModelImage(number, camera, name, _viewmat(np.array(pose)), features)
-    doubt = _take_poses_of_frames(known_images, folder / f"rigs{suffix}", folder / f"frames{suffix}")
+    doubt = _take_poses_of_frames(known_images, *(folder / f"{file}{images.suffix}" for file in ("rigs", "frames")))
     order = np.argsort(known_points["id"], kind="stable")
     return ColmapModel(known_cameras, [*known_images.values()], known_points[order], doubt)
 

@@ -76,8 +76,9 @@ def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> 
     x, y, depth = np.einsum("vij,vj->iv", Ks, viewmats[:, :3, :3] @ focus + viewmats[:, :3, 3])
     inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < sizes[:, 0] * depth) & (y < sizes[:, 1] * depth)
     if inside.mean() < LOOKING:
-        within = points_in_views(viewmats, Ks, sizes, np.tile(_depth_bounds(centers), (len(centers), 1)))
-        return within, "before the cameras, which do not look at one thing"
+        return _points_in_views(
+            viewmats, Ks, sizes, *_depth_bounds(centers)
+        ), "before the cameras, which do not look at one thing"
     side = float(np.median(np.linalg.norm(centers - focus, axis=1))) or 1.0
     within = np.random.default_rng(0).uniform(-0.5, 0.5, (NUM_RANDOM_POINTS, 3))
     return focus + within * side, "about what the cameras look at"
@@ -97,22 +98,17 @@ def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
     return extent * min(0.5, spacing**0.5), extent * 10.0
 
 
-def points_in_views(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """[`NUM_RANDOM_POINTS`, 3] float64 points drawn at random, the same for the same arguments.
-
-    A view and a place in it are drawn evenly, and the inverse of the depth between its nearest and farthest, `bounds`
-    [V, 2]: so the points lie as densely in the image as in depth, as far as parallax can tell depths apart.
-    """
+def _points_in_views(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, near: float, far: float) -> np.ndarray:
+    """[`NUM_RANDOM_POINTS`, 3] float64: a view and a place in it are drawn evenly, and the inverse of the depth between
+    `near` and `far`, so that points lie as densely in the image as in depth, as far as parallax tells depths apart."""
     random, count = np.random.default_rng(0), NUM_RANDOM_POINTS
     views = random.integers(0, len(viewmats), count)
     pixels = random.uniform(size=(count, 2)) * sizes[views]
     shares = random.uniform(size=count)
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused by the capture's check
-        near, far = (1.0 / bounds[views]).T
-        depths = 1.0 / (far + shares * (near - far))
-        rays = (pixels - Ks[views, :2, 2]) / Ks[views][:, [0, 1], [0, 1]]  # [M, 2]
-        in_camera = depths[:, None] * np.column_stack([rays, np.ones(len(rays))])
-        return np.einsum("mji,mj->mi", viewmats[views, :3, :3], in_camera - viewmats[views, :3, 3])
+    depths = 1.0 / (1.0 / far + shares * (1.0 / near - 1.0 / far))
+    rays = (pixels - Ks[views, :2, 2]) / Ks[views][:, [0, 1], [0, 1]]  # [M, 2]
+    in_camera = depths[:, None] * np.column_stack([rays, np.ones(len(rays))])
+    return np.einsum("mji,mj->mi", viewmats[views, :3, :3], in_camera - viewmats[views, :3, 3])
 
 
 def colors_in_photos(points: Tensor, cameras: Cameras, photos: Photos, masks: PixelMasks | None = None) -> Tensor:

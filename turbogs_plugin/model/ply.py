@@ -20,7 +20,7 @@ from turbogs_plugin.types import Gaussians
 POSITION_ERROR = 1e-6
 """Largest `rounding` of positions that are written as float."""
 OWN = Frame(np.zeros(3), 1.0)  # the frame that is the capture's own coordinates
-FEWEST_TOLD = 100  # Gaussians; all scales above 1 with all logits, which differ, in [0, 1] are no trained model
+FEWEST_TOLD = 100  # Gaussians; no trained model has scales all above 1, and half below e^.1 or logits, too, in [0, 1]
 HEADER_AT_MOST = 1 << 16  # bytes of a file in which a comment is looked for
 ANTIALIASED = re.compile(rb"^comment\s+(splatrendermode:\s*mip|antialiased\W+(1|true))\b", re.MULTILINE | re.IGNORECASE)
 """Brush's comment, which splat-transform writes, too, and Postshot's."""
@@ -76,8 +76,9 @@ def read_ply(path: Path) -> tuple[Gaussians, bool]:
     table = torch.from_numpy(np.stack([vertices[name] for name in names], axis=1, dtype=np.float64))  # [N, D]
     means, sh0, shN, opacities, scales, quats = table.split([len(group) for group in groups.values()], dim=1)
     opacities = opacities[:, 0]
-    if count >= FEWEST_TOLD and (scales > 0).all() and 0 <= opacities.min() < opacities.max() <= 1:
-        raise InputError(f"{path} has activated opacities and scales: export their logits and logarithms, as 3DGS does")
+    shares, small = 0 <= opacities.min() < opacities.max() <= 1, scales.median() < 0.1
+    if count >= FEWEST_TOLD and (scales > 0).all() and (shares or small):
+        raise InputError(f"{path} has activated scales: export logarithms of scales, logits of opacities, as 3DGS does")
     if "filter_3D" in vertices:
         sizes = torch.from_numpy(vertices["filter_3D"].astype(np.float64))  # [N] standard deviations
         wider = 0.5 * torch.logaddexp(2.0 * scales, 2.0 * sizes.log()[:, None])

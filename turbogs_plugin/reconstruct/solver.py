@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from turbogs_plugin.captures.colmap import load_pycolmap
+from turbogs_plugin.captures.matches import EPIPOLAR_SHARE, epipolar_distances
 from turbogs_plugin.reconstruct.ghosts import Agreement
 from turbogs_plugin.reconstruct.photos import PhotoFile
 
@@ -25,8 +26,6 @@ LONG_SIDE = 1600
 MANY, DEFAULT_MODEL = 10, "SIMPLE_RADIAL"
 """A lens with at least this many photos gets COLMAP's OPENCV model (two radial and two tangential coefficients), other
 lenses its default, one radial coefficient. On fox OPENCV halves the error of the cameras."""
-EPIPOLAR_SHARE = 3e-3
-"""A match agrees with two cameras that are nearer to its epipolar line than this share of the photos' longer side."""
 GROWTH, TOLERANCE, REFINEMENTS = 1.3, 1e-4, 1
 """Growth of a model after which all its cameras and points are adjusted; relative gain at which an adjustment ends;
 adjustments of what is near a new photo. COLMAP's 1.1, 0 and 2 take twice as long in all, for the same cameras."""
@@ -117,24 +116,6 @@ def measure_agreement(model: pycolmap.Reconstruction, database: Path) -> Agreeme
             counts.append((min(first, second), max(first, second), agree, len(matches) - agree))
     table = np.array(counts, dtype=np.int64).reshape(-1, 4)
     return Agreement(tuple(image.name for image in images), table[:, :2], table[:, 2], table[:, 3])
-
-
-def epipolar_distances(relative: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """[N] Sampson distances of matches from the epipolar lines of two cameras, at a focal length of 1; 0 for cameras in
-    one place, which have no lines.
-
-    Args:
-        relative: [4, 4], from the first camera to the second.
-        first, second: [N, 3], the matches on the cameras' image planes, z = 1.
-    """
-    rotation, translation = relative[:3, :3], relative[:3, 3]
-    length = np.linalg.norm(translation)
-    if length == 0:
-        return np.zeros(len(first))
-    essential = np.cross(np.eye(3), translation / length).T @ rotation
-    lines, back = first @ essential.T, second @ essential
-    size = np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1))
-    return np.abs((second * lines).sum(axis=1)) / np.maximum(size, 1e-12)
 
 
 def without_pairs(database: Path, copy: Path, pairs: Sequence[tuple[str, str]]) -> None:

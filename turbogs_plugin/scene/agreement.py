@@ -3,6 +3,8 @@ has learnt nothing, so it is refused before its first iteration."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from turbogs_plugin.errors import InputError
@@ -11,6 +13,8 @@ from turbogs_plugin.scene.scene import PosedImages, Scene
 
 SHORTEST_LENS = 0.05
 """Focal length over the photo's width below which it is no number of pixels: a view of 169 degrees or more."""
+LEAST_MIDDLE, MOST_MIDDLE = 0.27, 0.9
+"""Principal points below or above which, in both axes, are of photos of another size, or counted from the middle."""
 MOST_POINTS, MOST_PHOTOS, MOST_PIXELS = 20_000, 16, 4096
 """Points, photos, and pixels of a photo that are examined, evenly spread."""
 FEWEST_PLACES = 50
@@ -21,6 +25,7 @@ LEAST_LIKENESS, DOUBTED, GAIN, LIKENESS, FEWEST_COLORS = 0.2, 0.3, 0.05, 0.4, 50
 """Likeness below which photos do not show the points; below which they do not if other photos' poses have as much; a
 likeness that explains it, and places that tell. Five captures have 0.51 to 0.82, a gain of 0.37 to 0.80; with inverse
 poses 0.08 at most, with shuffled photos 0.28 and no gain."""
+REORDER = "reorder the quaternions that they are made of: COLMAP's files have w, x, y, z, and scipy x, y, z, w"
 ONE_PLACE = 1e-3  # extents: cameras nearer to each other than this stand in one place
 OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y down, z forward to x right, y up, z backward, and back
 OTHER_AXES_REMEDY = 'write "axes": "opencv" into transforms.json, or multiply columns 2 and 3 of each pose by -1'
@@ -34,24 +39,16 @@ def require_agreement(scene: Scene) -> None:
         raise InputError(f"'{scene.name}': {cause}; scene.force=true trains all the same")
 
 
-def unseeing_note(scene: Scene) -> str:
-    """A line on cameras that see none of the points, which no error tells; empty where each sees one."""
-    points, blind = scene.points.cpu().numpy(), []
-    for views in () if scene.drawn_points else (scene.train, scene.test):
-        viewmats, Ks = views.cameras.viewmats.cpu().numpy(), views.cameras.Ks.cpu().numpy()
-        for name, viewmat, K, size in zip(views.names, viewmats, Ks, views.cameras.sizes, strict=True):
-            steps = max(1, len(points) // MOST_POINTS), 1  # all of them where none of some is seen
-            if not any(len(seen(points[::step], viewmat, K, size)[0]) for step in steps):
-                blind.append(name)
-    return f"{len(blind)} cameras see none of the points: {', '.join(blind[:3])}" if blind else ""
-
-
 def _contradiction(scene: Scene) -> str:
     """The cause and the remedy of `require_agreement`; empty where nothing contradicts."""
     views = scene.train
     lens = float(np.median(views.cameras.Ks[:, 0, 0].cpu().numpy() / views.cameras.sizes[:, 0]))
     if lens < SHORTEST_LENS:
         return f"focal lengths are {lens:.2g} of the photos' width: write intrinsics in pixels, not in shares of it"
+    x, y = middle = np.median(views.cameras.Ks[:, :2, 2].cpu().numpy() / views.cameras.sizes, axis=0)
+    if (middle < LEAST_MIDDLE).all() or (middle > MOST_MIDDLE).all():
+        place = f"principal points are at {x:.2g}, {y:.2g} of the photos' width and height"
+        return f"{place}, not near .5: write the photos' size (w, h), and pixels of it from the upper left corner"
     pixels = [_pixels(views, view_id) for view_id in evenly(len(views), MOST_PHOTOS)]
     if views.photos.transparent and not any(part[:, 3].any() for part in pixels):
         return "all photos are transparent everywhere (alpha 0): write them without alpha"
@@ -69,16 +66,34 @@ def _contradiction(scene: Scene) -> str:
         what = "photos do not show the points where the cameras see them"
     elif places >= min(FEWEST_PLACES, len(scene.points)):
         return ""
-    inverse = np.linalg.inv(poses)
-    for other, remedy in (
-        (OTHER_AXES @ poses, f"{OTHER_AXES_REMEDY} (its axes are others)"),
-        (inverse, INVERT),
-        (OTHER_AXES @ inverse @ OTHER_AXES, INVERT),
-        (inverse @ OTHER_AXES, f'{INVERT}, and write "axes": "opencv" into transforms.json'),
-    ):
+    for other, remedy in likely_poses(poses):
         if likeness(scene, other)[1] >= LIKENESS:
             return f"{what}, and with other poses they do: {remedy}"
     return f"{what}: {scene.doubt or 'poses, intrinsics, points and photos must be of one solve and in one frame'}"
+
+
+def likely_poses(poses: np.ndarray) -> Iterator[tuple[np.ndarray, str]]:
+    """Poses that a mistake of the kinds that scripts make has turned into `poses` ([V, 4, 4] world to camera, in the
+    capture's coordinates), each with the remedy."""
+    inverse = np.linalg.inv(poses)
+    yield OTHER_AXES @ poses, f"{OTHER_AXES_REMEDY} (its axes are others)"
+    yield inverse, INVERT
+    yield OTHER_AXES @ inverse @ OTHER_AXES, INVERT
+    yield inverse @ OTHER_AXES, f'{INVERT}, and write "axes": "opencv" into transforms.json'
+    for first in (1, -1):
+        yield _reordered(poses, first), REORDER
+        for axes in (np.eye(4), OTHER_AXES):
+            yield np.linalg.inv(_reordered(inverse @ axes, first) @ axes), REORDER
+
+
+def _reordered(poses: np.ndarray, first: int) -> np.ndarray:
+    """The poses with another order of their quaternions: the numbers are moved by `first` places."""
+    from scipy.spatial.transform import Rotation
+
+    reordered = poses.copy()
+    quats = np.roll(Rotation.from_matrix(poses[:, :3, :3]).as_quat(), first, axis=1)
+    reordered[:, :3, :3] = Rotation.from_quat(quats).as_matrix()
+    return reordered
 
 
 def likeness(scene: Scene, poses: np.ndarray) -> tuple[int, float]:

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError
-from turbogs_plugin.scene.geometry import Observations
 from turbogs_plugin.types import Cameras, PixelSamples
+from turbogs_plugin.types.cameras import Observations
 
 CELL = 4
 """Side in pixels of a cell, all of which has the depth of the point that the photo shows in it. On a surface turned

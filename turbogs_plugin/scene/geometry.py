@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from torch import Tensor
 
@@ -79,23 +77,3 @@ def mean_neighbor_distances(points: Tensor, neighbors: int) -> Tensor:
     # In the points' own precision. The first is the point itself, or another one in its place.
     x, y, z = ((places[:, None, axis] - places[nearest][:, :, axis]).square() for axis in range(3))
     return (x + y + z).sort(dim=1).values[:, 1:].sqrt().mean(dim=1).to(points.device)
-
-
-@dataclass(frozen=True)
-class Observations:
-    """Places where V photos show points; the centre of a photo's first pixel is (0.5, 0.5)."""
-
-    pixels: np.ndarray  # [O, 2] float64
-    view_ids: np.ndarray  # [O] int64, ascending
-    point_ids: np.ndarray  # [O] int64
-
-    def __len__(self) -> int:
-        return len(self.pixels)
-
-    def of_views(self, views: np.ndarray, ratios: np.ndarray) -> Observations:
-        """The observations by some views ([W] int64, ascending), which become the first, second, ...; in pixels of
-        photos of another size, by the `ratios` [W, 2] of width and height."""
-        starts, ends = (np.searchsorted(self.view_ids, views, side) for side in ("left", "right"))
-        rows = np.concatenate([np.arange(*ends_of) for ends_of in zip(starts, ends, strict=True)] or [starts])
-        now = np.repeat(np.arange(len(views)), ends - starts)
-        return Observations(self.pixels[rows] * ratios[now], now, self.point_ids[rows])

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene.frame import Frame
-from turbogs_plugin.scene.geometry import Observations
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.types import Cameras
+from turbogs_plugin.types.cameras import Observations
 
 
 @dataclass

@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 
 from turbogs_plugin.captures.bundle_adjustment import find_cameras, with_cameras
-from turbogs_plugin.captures.load import load_scene
+from turbogs_plugin.captures.load import load_scene, unseeing_note
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.sections import SceneConfig
 from turbogs_plugin.device import synchronize
@@ -18,7 +18,7 @@ from turbogs_plugin.distributed.ranks import ONE, Ranks
 from turbogs_plugin.engine import library
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Scene
-from turbogs_plugin.scene.agreement import require_agreement, unseeing_note
+from turbogs_plugin.scene.agreement import require_agreement
 from turbogs_plugin.train.wall import WallClock
 
 
@@ -59,9 +59,9 @@ def open_scene(settings: SceneConfig, refine: bool, ranks: Ranks = ONE, trained:
     if not (settings.force or trained):
         require_agreement(scene)
         if scene.drawn_points:
-            from turbogs_plugin.reconstruct.axes import require_axes  # no other capture needs that room
+            from turbogs_plugin.reconstruct.pose_check import require_poses  # no other capture needs that room
 
-            require_axes(scene)
+            require_poses(scene)
     if note := unseeing_note(scene):
         scene = replace(scene, notes=(*scene.notes, note))
     cameras = find_cameras(scene, refine) if ranks.first else None

@@ -1,8 +1,9 @@
-"""Cameras of photos, and colours."""
+"""Cameras of photos, where these show points, and colours."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -88,3 +89,23 @@ class Cameras:
     def directions(self) -> Tensor:
         """[C, 3] unit viewing directions in the world."""
         return torch.nn.functional.normalize(self.viewmats[:, 2, :3], dim=-1)
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Places where V photos show points; the centre of a photo's first pixel is (0.5, 0.5)."""
+
+    pixels: np.ndarray  # [O, 2] float64
+    view_ids: np.ndarray  # [O] int64, ascending
+    point_ids: np.ndarray  # [O] int64
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def of_views(self, views: np.ndarray, ratios: np.ndarray) -> Observations:
+        """The observations by some views ([W] int64, ascending), which become the first, second, ...; in pixels of
+        photos of another size, by the `ratios` [W, 2] of width and height."""
+        starts, ends = (np.searchsorted(self.view_ids, views, side) for side in ("left", "right"))
+        rows = np.concatenate([np.arange(*ends_of) for ends_of in zip(starts, ends, strict=True)] or [starts])
+        now = np.repeat(np.arange(len(views)), ends - starts)
+        return Observations(self.pixels[rows] * ratios[now], now, self.point_ids[rows])
