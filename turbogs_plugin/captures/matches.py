@@ -53,9 +53,8 @@ def rigid(pair: Pair) -> np.ndarray:
     pycolmap = load_pycolmap()
     camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=1, height=1, params=[1.0, 0.0, 0.0])
     options = pycolmap.RANSACOptions(max_error=0.5 * EPIPOLAR_SHARE, max_num_trials=1000, random_seed=0)
-    first, second = (rays[:, :2] for rays in pair[2:])
-    found = pycolmap.estimate_essential_matrix(first, second, camera, camera, options)
-    return np.zeros(len(first), dtype=bool) if found is None else found["inlier_mask"]
+    found = pycolmap.estimate_essential_matrix(*(rays[:, :2] for rays in pair[2:]), camera, camera, options)
+    return np.zeros(len(pair[2]), dtype=bool) if found is None else found["inlier_mask"]
 
 
 def epipolar_distances(relative: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

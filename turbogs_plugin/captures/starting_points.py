@@ -76,9 +76,8 @@ def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> 
     x, y, depth = np.einsum("vij,vj->iv", Ks, viewmats[:, :3, :3] @ focus + viewmats[:, :3, 3])
     inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < sizes[:, 0] * depth) & (y < sizes[:, 1] * depth)
     if inside.mean() < LOOKING:
-        return _points_in_views(
-            viewmats, Ks, sizes, *_depth_bounds(centers)
-        ), "before the cameras, which do not look at one thing"
+        points = _in_views(viewmats, Ks, sizes, *_depth_bounds(centers))
+        return points, "before the cameras, which do not look at one thing"
     side = float(np.median(np.linalg.norm(centers - focus, axis=1))) or 1.0
     within = np.random.default_rng(0).uniform(-0.5, 0.5, (NUM_RANDOM_POINTS, 3))
     return focus + within * side, "about what the cameras look at"
@@ -98,7 +97,7 @@ def _depth_bounds(centers: np.ndarray) -> tuple[float, float]:
     return extent * min(0.5, spacing**0.5), extent * 10.0
 
 
-def _points_in_views(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, near: float, far: float) -> np.ndarray:
+def _in_views(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray, near: float, far: float) -> np.ndarray:
     """[`NUM_RANDOM_POINTS`, 3] float64: a view and a place in it are drawn evenly, and the inverse of the depth between
     `near` and `far`, so that points lie as densely in the image as in depth, as far as parallax tells depths apart."""
     random, count = np.random.default_rng(0), NUM_RANDOM_POINTS

@@ -13,8 +13,7 @@ from turbogs_plugin.scene.scene import PosedImages, Scene
 
 SHORTEST_LENS = 0.05
 """Focal length over the photo's width below which it is no number of pixels: a view of 169 degrees or more."""
-LEAST_MIDDLE, MOST_MIDDLE = 0.27, 0.9
-"""Principal points below or above which, in both axes, are of photos of another size, or counted from the middle."""
+LEAST_MIDDLE, MOST_MIDDLE = 0.27, 0.9  # principal points of photos of this size lie between, in one axis at least
 MOST_POINTS, MOST_PHOTOS, MOST_PIXELS = 20_000, 16, 4096
 """Points, photos, and pixels of a photo that are examined, evenly spread."""
 FEWEST_PLACES = 50
@@ -28,6 +27,8 @@ poses 0.08 at most, with shuffled photos 0.28 and no gain."""
 REORDER = "reorder the quaternions that they are made of: COLMAP's files have w, x, y, z, and scipy x, y, z, w"
 ONE_PLACE = 1e-3  # extents: cameras nearer to each other than this stand in one place
 OTHER_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y down, z forward to x right, y up, z backward, and back
+QUARTER = np.eye(4)[[1, 0, 2, 3]] * [[-1.0], [1.0], [1.0], [1.0]]  # a turn of the camera about its axis
+UPRIGHT = "turn the photos to how the cameras were found (an EXIF orientation is not followed), and write w and h"
 OTHER_AXES_REMEDY = 'write "axes": "opencv" into transforms.json, or multiply columns 2 and 3 of each pose by -1'
 INVERT = "invert each pose's matrix (camera to world is taken for world to camera, or the other way round)"
 
@@ -80,6 +81,8 @@ def likely_poses(poses: np.ndarray) -> Iterator[tuple[np.ndarray, str]]:
     yield inverse, INVERT
     yield OTHER_AXES @ inverse @ OTHER_AXES, INVERT
     yield inverse @ OTHER_AXES, f'{INVERT}, and write "axes": "opencv" into transforms.json'
+    for turns in (1, 2, 3):
+        yield np.linalg.matrix_power(QUARTER, turns) @ poses, UPRIGHT
     for first in (1, -1):
         yield _reordered(poses, first), REORDER
         for axes in (np.eye(4), OTHER_AXES):
