@@ -28,17 +28,28 @@ def require_samples(samples: PixelSamples, view_ids: Sequence[int], sizes: np.nd
             raise InputError(f"{type(sampler).__name__} {said}: give view_ids, and masks [K, H, W], to from_mask")
 
 
-def require_rows(update: RowUpdate, controller: DensityController) -> None:
-    """Raise `InputError` unless the parts of a change of rows fit together."""
+def require_rows(update: RowUpdate, controller: DensityController, old_count: int) -> None:
+    """Raise `InputError` unless the parts of a change of `old_count` rows fit together."""
     require_type(update, RowUpdate, controller)
     count, kind = len(update.source), update.source.dtype
     wrong = [f"values of {name}" for name in update.values if name not in PARAMETER_NAMES]
     wrong += [f"{len(value)} values of {name}" for name, value in update.values.items() if len(value) != count]
     wrong += [f"fresh of {len(update.fresh)} rows"] if len(update.fresh) != count else []
+    if count and kind == torch.int64:  # the one wait for a GPU here; an event has others
+        least, most = (int(value) for value in update.source.aminmax())
+        wrong += [f"source {least} .. {most} of {old_count} old rows"] if least < 0 or most >= old_count else []
     wrong += [f"source of {kind}"] if kind != torch.int64 else []
     if wrong:
         said = f"{type(controller).__name__} returned a RowUpdate of {count} rows with {wrong[-1]}"
         raise InputError(f"{said}: source has old rows, as of torch.nonzero; fresh and parameters' values as many")
+
+
+def require_stats(controller: DensityController, count: int) -> None:
+    """Raise `InputError` unless the controller's statistics have a row for each of `count` Gaussians."""
+    stats = controller.stats
+    if stats is not None and (found := len(stats.weight_sums)) != count:
+        remedy = "in apply(self, update), self.stats = self.stats.map(update.apply_state)"
+        raise InputError(f"{type(controller).__name__}.stats has {found} rows for {count} Gaussians: {remedy}")
 
 
 def require_output(output: LossOutput, colors: Tensor, loss: SparseLoss) -> None:

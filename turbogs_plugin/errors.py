@@ -39,7 +39,7 @@ def require_not_negative(instance: object, *fields: str) -> None:
 def nearest(name: object, known: Iterable[str]) -> str:
     """A hint for an unknown name: the nearest known one, where one is near, and all of them."""
     known = sorted(known)
-    close = [each for each in known if str(name).startswith(each) or each.startswith(str(name))]
+    close = [each for each in known if str(name).startswith(each) or str(name) in each]
     close, names = close or difflib.get_close_matches(str(name), known, n=1, cutoff=0.67), ", ".join(known) or "none"
     return f"did you mean '{close[0]}'? (known: {names})" if close else f"known are {names}"
 

@@ -27,10 +27,11 @@ from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.files import require_writable
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
+from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.rows import NoDensity
 from turbogs_plugin.strategies.losses import CharbonnierLoss
 from turbogs_plugin.strategies.protocols import SparseLoss
-from turbogs_plugin.strategies.returned import require_rows
+from turbogs_plugin.strategies.returned import require_rows, require_stats
 from turbogs_plugin.train import run
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.history import read_history
@@ -39,7 +40,7 @@ from turbogs_plugin.train.metrics import evaluate
 from turbogs_plugin.train.run import fit
 from turbogs_plugin.train.session import interruptible
 from turbogs_plugin.train.trainer import Trainer
-from turbogs_plugin.types import LossOutput, PixelSamples, RowUpdate
+from turbogs_plugin.types import GaussianStats, LossOutput, PixelSamples, RowUpdate
 from turbogs_plugin.yaml_json import parse_yaml
 
 pytestmark = pytest.mark.usefixtures("plotted")
@@ -232,6 +233,15 @@ def test_a_model_that_is_lost_ends_the_run_and_is_never_saved(capture, tmp_path,
     assert all(value.isfinite().all() for value in saved(tmp_path / "run")["gaussians"].values())
 
 
+def test_a_training_without_a_finite_loss_ends(capture, tmp_path):
+    class Lost(SparseLoss):
+        def __call__(self, colors, targets, samples):
+            return LossOutput(colors.sum() * torch.nan, colors * torch.nan, colors[:, 0] * torch.nan)
+
+    with pytest.raises(TrainingStopped, match="iteration 7: no loss was finite: see Lost"):
+        fit(capture, config=tiny_config(capture).to_mapping(), loss=Lost())
+
+
 def test_non_finite_losses_are_counted(capture, tmp_path, monkeypatch):
     def spoil(trainer):
         trainer.views.photos.colors = trainer.views.photos.colors.float() * torch.nan
@@ -354,12 +364,21 @@ ROWS, SAME = torch.arange(3), torch.zeros(3, dtype=torch.bool)
         (RowUpdate(ROWS, SAME, {"scales": torch.zeros(4, 3)}), "of 3 rows with 4 values of scales"),
         (RowUpdate(ROWS, SAME[:2], {}), "with fresh of 2 rows"),
         (RowUpdate(~SAME, SAME, {}), r"with source of torch\.bool: source has old rows, as of torch\.nonzero"),
+        (RowUpdate(ROWS + 1, SAME, {}), r"with source 1 \.\. 3 of 3 old rows"),
         (SAME, "NoDensity returned Tensor, not RowUpdate"),
     ],
 )
 def test_a_change_of_rows_that_does_not_fit_together_is_refused(update, message):
     with pytest.raises(InputError, match=message):
-        require_rows(update, NoDensity())
+        require_rows(update, NoDensity(), 3)
+
+
+def test_statistics_that_do_not_follow_their_gaussians_are_named():
+    density = ErrorDrivenDensity()
+    density.stats = GaussianStats.zeros(3, "cpu")
+    require_stats(density, 3)
+    with pytest.raises(InputError, match=r"ErrorDrivenDensity.stats has 3 rows for 4 Gaussians: in apply"):
+        require_stats(density, 4)
 
 
 def test_a_folder_that_cannot_be_written_is_not_resumed(capture, tmp_path, monkeypatch):

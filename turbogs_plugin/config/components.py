@@ -47,7 +47,7 @@ def strategy_class(kind: str, name: Any) -> type:
         known = {point.name: point.value for point in entry_points(group=f"turbogs.{kind}")} | known
     if name not in known:
         raise InputError(f"unknown {kind}.type '{name}': {nearest(name, known)}; another's needs its package installed")
-    place = f"{kind}.type '{name}' ({known[name]})"
+    place = f"{kind}.type '{name}'" + (f" ({known[name]})" if known[name] != name else "")
     try:
         found = EntryPoint(name, known[name], f"turbogs.{kind}").load()
     except (Exception, SystemExit) as error:  # another's module can do anything as it is imported
@@ -91,8 +91,7 @@ def build(kind: str, mapping: Any) -> Any:
     if not isinstance(mapping, Mapping):
         raise InputError(f"{kind}: expected a mapping with a 'type', got {mapping!r}")
     type_name = mapping.get("type", default_type(kind))
-    found = strategy_class(kind, type_name)
-    strategy: Any = build_dataclass(found, mapping, kind, apart=("type",))
+    strategy: Any = build_dataclass(strategy_class(kind, type_name), mapping, kind, apart=("type",))
     return completed(kind, strategy, f"{kind}.type '{type_name}'")
 
 

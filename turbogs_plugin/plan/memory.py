@@ -50,8 +50,7 @@ def cap_of(config: Config) -> int:
 def with_cap(config: Config, cap: int) -> Config:
     """The configuration with this cap. Raises `InputError` where its density control keeps none."""
     if "max_gaussians" not in config.density:
-        kind = config.density["type"]
-        raise InputError(f"density.type {kind} keeps no cap on Gaussians: use one of error_driven, mcmc, none")
+        raise InputError(f"density.type {config.density['type']} keeps no cap: its class needs a field max_gaussians")
     return config.changed(density={"max_gaussians": cap})
 
 

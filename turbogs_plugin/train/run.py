@@ -205,8 +205,8 @@ def train(
             held.enter_context(folder.owned(new=True))
         if ranks.first:
             resolved, told = loop.trainer.config, [*scene.notes, plan.text()]
-            if resolved.budget.time:
-                told.append(f"{resolved.budget.time} of training: about {resolved.train.iterations} iterations")
+            if seconds := resolved.budget.seconds():
+                told.append(f"{seconds:g} s of training: about {resolved.train.iterations} iterations")
             if device.type == "cpu":
                 told.append(cpu_note())
             print("\n".join(told), file=sys.stderr)

@@ -17,7 +17,7 @@ from turbogs_plugin.model.limits import RESTRAIN_EVERY, restrain_distant
 from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.scene.depths import DepthPair
 from turbogs_plugin.scene.photos import PhotoSamples
-from turbogs_plugin.strategies.returned import require_output, require_rows, require_samples
+from turbogs_plugin.strategies.returned import require_output, require_rows, require_samples, require_stats
 from turbogs_plugin.train.training_state import TrainingState
 from turbogs_plugin.types import GaussianStats, LossOutput, PixelSamples, RowUpdate, Step
 
@@ -123,9 +123,8 @@ class Trainer(TrainingState):
         before = self.gaussians.map(Tensor.clone) if overflow is not None and self.density.moves_model else None
         update = self.density.update(self.gaussians, step)
         if overflow is not None and before is not None and update is None:
-            kept = overflow.eq(0)
             for name, value in self.gaussians.items():
-                value.copy_(torch.where(kept, value, getattr(before, name)))
+                value.copy_(torch.where(overflow.eq(0), value, getattr(before, name)))
         return self.engine.agreed(update) if due else update
 
     def follow(self, update: RowUpdate | None) -> None:
@@ -133,12 +132,13 @@ class Trainer(TrainingState):
         until `refine_until`. Not in the paper: what stands right before a camera goes with any change; and the size of
         distant Gaussians is limited, every `RESTRAIN_EVERY` iterations, also without a change."""
         if update is not None:
-            require_rows(update, self.density)
+            require_rows(update, self.density, len(self.gaussians))
             if self.clearance is not None:
                 update = self.clearance.clear(update, self.gaussians)
             if len(update.source) == 0:
                 raise TrainingStopped(f"iteration {self.iteration}: every Gaussian was removed")
             update = in_order_of_space(update, self.gaussians, self.now)
             self.change_rows(update)
+            require_stats(self.density, len(self.gaussians))
         if self.config.train.distant_size > 0 and self.iteration % RESTRAIN_EVERY == 0:
             restrain_distant(self.gaussians, self.extent, self.config.train.distant_size)

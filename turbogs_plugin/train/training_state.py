@@ -200,10 +200,12 @@ class TrainingState:
         self.engine.verify(self.state_dict)
 
     def require_finite(self) -> None:
-        """Raise `TrainingStopped` where a parameter is not finite, which later iterations would not repair."""
+        """Raise `TrainingStopped` where a parameter is not finite, or no loss so far was: later ones would not be."""
         if bad := int((~self.gaussians.finite_rows()).sum()):
             share = f"{bad} of {len(self.gaussians)}"
             raise TrainingStopped(f"iteration {self.iteration}: {share} Gaussians are not finite")
+        if 0 < self.iteration == int(self.nonfinite_losses):
+            raise TrainingStopped(f"iteration {self.iteration}: no loss was finite: see {type(self.loss).__name__}")
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that iterations change, as plain tensors and numbers. A resume from it is bit for bit the same on
