@@ -47,7 +47,7 @@ def test_a_time_budget_holds(turbogs, capture, tmp_path, monkeypatch):
     state = load_checkpoint(latest_checkpoint(out / "checkpoints"))
     assert state["trainer"]["iteration"] == state["pace"]["iterations"] == end.iteration
     assert state["pace"]["refine_until"] < end.iteration
-    assert (out / "report.md").is_file() and "6s of training: about" in error
+    assert (out / "report.md").is_file() and "6 s of training: about" in error
     assert turbogs("train", "--resume", out)[1] == f"{out} is finished: its model is {out / 'model.ply'}\n"
 
 
