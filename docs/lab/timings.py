@@ -98,32 +98,32 @@ def rank_runs() -> str:
 
 
 SWAPS = {
-    "stock": "stock",
     "step": "the whole step",
     "density": "density control",
     "errors": "density control, ranked by errors",
     "lm": "density control by errors, and Moment-LM",
     "sparse": "sparse pixels, 4 views",
 }
-"""Variants of examples/simple_trainer/compare.py."""
 
 
 def dropin() -> str:
-    """gsplat's trainer with each swap at its end, and beside stock at the earlier of both ends: a table a file."""
+    """Variants of examples/simple_trainer/compare.py, means over seeds; and beside stock at the earlier end."""
     parts = []
     for record in sorted((read_json(file.name) for file in LAB.glob("dropin*.json")), key=lambda of: of["date"]):
-        stock = {run["scene"]: run["marks"] for run in record["runs"] if run["variant"] == "stock"}
-        lines = []
+        runs: dict[tuple[str, str], list[list[dict[str, float]]]] = {}
         for run in record["runs"]:
-            end, beside = run["marks"][-1], ""
-            if run["variant"] != "stock" and run["scene"] in stock:
-                seconds = min(end["seconds"], stock[run["scene"]][-1]["seconds"])
-                ours, theirs = (psnr_at(marks, seconds) for marks in (run["marks"], stock[run["scene"]]))
+            runs.setdefault((run["scene"], run["variant"]), []).append(run["marks"])
+        lines = []
+        for (scene, variant), seeds in runs.items():
+            end, beside = {name: statistics.fmean(marks[-1][name] for marks in seeds) for name in seeds[0][-1]}, ""
+            if variant != "stock" and (stock := runs.get((scene, "stock"))):
+                seconds = min(end["seconds"], stock[0][-1]["seconds"])
+                ours, theirs = (statistics.fmean(psnr_at(marks, seconds) for marks in of) for of in (seeds, stock))
                 beside = f"{ours - theirs:+.2f} dB: {ours:.2f} for {theirs:.2f} at {seconds:.0f} s"
             texts = (f"{end[name]:.{digits}f}" for name, digits in (("seconds", 1), ("psnr", 2), ("ssim", 4)))
-            texts = (*texts, f"{end['gaussians'] / 1e3:.0f}k")
-            lines.append((run["scene"], SWAPS[run["variant"]], end["step"], *texts, beside))
-        head = ("capture", "swap", "steps", "s", "PSNR", "SSIM", "Gaussians", "PSNR beside stock's, equal time")
+            texts = (f"{end['step']:.0f}", *texts, f"{end['gaussians'] / 1e3:.0f}k")
+            lines.append((scene, f"{SWAPS.get(variant, variant)} ({len(seeds)})", *texts, beside))
+        head = ("capture", "swap (seeds)", "steps", "s", "PSNR", "SSIM", "Gaussians", "PSNR beside stock's, equal time")
         parts.append(f"{record['device']}, {record['date']}:\n\n{table(head, lines)}")
     return "\n\n".join(parts)
 

@@ -1,5 +1,5 @@
 """What docs/drop-in.md prints, run as printed: sparse pixels, sampler and loss in the names of gsplat's trainer, and
-recipes for nerfstudio's splatfacto and for NerfBaselines in stand-ins of their classes.
+recipes for nerfstudio's splatfacto, NerfBaselines and GTSFM in stand-ins of their classes.
 """
 
 import copy
@@ -209,3 +209,19 @@ def test_nerfbaselines_trains_with_the_recipe(monkeypatch):
     assert method.step == 14 and infos[-1]["loss"] < infos[0]["loss"]
     assert infos[-1]["num_gaussians"] == len(splats["means"]) > 40
     assert method.turbo.trainer.config.train.background == "white"
+
+
+def test_gtsfm_trains_with_the_recipe(monkeypatch):
+    """Opacities are [N, 1] there, harmonics slices of one tensor, poses without the last row."""
+    splats, cameras, names = make_splats(), make_cameras(3), {}
+    harmonics = torch.cat([splats["sh0"], splats["shN"]], dim=1).detach()
+    splats |= {"opacities": splats["opacities"].detach()[:, None], "sh0": harmonics[:, :1], "shN": harmonics[:, 1:]}
+    photo, poses = torch.full((HEIGHT, WIDTH, 3), 0.8), torch.linalg.inv(cameras.viewmats)[:, :3]
+    views = [{"image": photo, "K": K, "wTc": pose} for K, pose in zip(cameras.Ks, poses, strict=True)]
+    theirs = type("GaussianSplatting", (), {"cfg": SimpleNamespace(max_steps=14)})
+    monkeypatch.setitem(sys.modules, "gtsfm.splat.gaussian_splatting", SimpleNamespace(GaussianSplatting=theirs))
+    exec(block("python", "class TurboSplatting"), names)
+    trained = names["TurboSplatting"]()._train(views, splats, {})
+    count = len(trained["means"])
+    assert trained is splats and trained["opacities"].shape == (count, 1) and count > 40
+    assert trained["sh0"].mean() > harmonics[:, :1].mean() + 0.1  # towards bright photos
