@@ -90,6 +90,17 @@ def test_parts_need_the_core_alone(said):
     assert said[1] == "used"
 
 
+def test_the_bridge_imports_little_and_starts_nothing():
+    """Configurations and trainer, which take time to import, come with the first use of TurboStep."""
+    code = """
+import sys, threading, gsplat, torch, turbogs_plugin.gsplat_bridge
+
+heavy = {"yaml", "PIL", "turbogs_plugin.config", "turbogs_plugin.train"} & {*sys.modules}
+assert not heavy and threading.active_count() == 1 and not torch.cuda.is_initialized(), heavy
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+
+
 def test_the_extra_is_what_the_commands_name(project):
     extras = project["optional-dependencies"]
     assert sorted(extras["train"]) == sorted(COMMAND_PACKAGES.values())
