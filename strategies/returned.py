@@ -35,10 +35,11 @@ def require_rows(update: RowUpdate, controller: DensityController, old_count: in
     wrong = [f"values of {name}" for name in update.values if name not in PARAMETER_NAMES]
     wrong += [f"{len(value)} values of {name}" for name, value in update.values.items() if len(value) != count]
     wrong += [f"fresh of {len(update.fresh)} rows"] if len(update.fresh) != count else []
-    if count and kind == torch.int64:  # the one wait for a GPU here; an event has others
-        least, most = (int(value) for value in update.source.aminmax())
+    if kind != torch.int64:
+        wrong.append(f"source of {kind}")
+    elif count:
+        least, most = torch.stack(update.source.aminmax()).tolist()  # one wait for a GPU; an event has others
         wrong += [f"source {least} .. {most} of {old_count} old rows"] if least < 0 or most >= old_count else []
-    wrong += [f"source of {kind}"] if kind != torch.int64 else []
     if wrong:
         said = f"{type(controller).__name__} returned a RowUpdate of {count} rows with {wrong[-1]}"
         raise InputError(f"{said}: source has old rows, as of torch.nonzero; fresh and parameters' values as many")

@@ -28,18 +28,14 @@ Pairs = dict[str, tuple[Cells, Cells]]
 
 def compared(studies: Sequence[str], variants: Sequence[str] | None) -> Pairs:
     """The captures on which the first study that has both variants has them."""
-    found: Pairs = {}
     for study in studies if variants else ():
-        for capture, cells in study_cells(study).items():
-            pair = [cells.get(name) for name in variants or ()]
-            if not found.get(capture) and all(pair) and Difference.between(*pair, "psnr").count:
-                found[capture] = (pair[0], pair[1])
-        if found:
-            break
-    return found
+        pairs = {of: tuple(cells.get(name, []) for name in variants or ()) for of, cells in study_cells(study).items()}
+        if found := {of: pair for of, pair in pairs.items() if Difference.between(*pair, "psnr").count}:
+            return found
+    return {}
 
 
-def by_capture(pairs: Pairs, timed: bool) -> str:
+def each_capture(pairs: Pairs, timed: bool) -> str:
     """A line for each capture."""
     return "<br>".join(f"{capture}: {change(*pair, timed=timed)}" for capture, pair in pairs.items()) or "-"
 
@@ -73,7 +69,7 @@ def paper_parts() -> str:
     for row in ROWS["paper parts"]:
         ours, papers = compared(DEFAULTS, row.get("ours")), compared(["paper_parts"], row.get("papers"))
         default = ("the paper's" if row["ours"][0] == "turbogs" else "ours") if ours else "-"
-        lines.append((row["name"], means(ours), by_capture(ours, False), by_capture(papers, True), default))
+        lines.append((row["name"], means(ours), each_capture(ours, False), each_capture(papers, True), default))
     head = ("the paper's part", "in our default, mean", "in our default, each capture", "in the paper's configuration")
     return table((*head, "default"), lines)
 
@@ -81,7 +77,7 @@ def paper_parts() -> str:
 def ideas() -> str:
     """Each idea of others: what it adds to `turbogs`."""
     rows = [(*row.values(), compared(["ideas"], (row["of"], "turbogs"))) for row in ROWS["ideas"]]
-    lines = [(name, prediction, means(pairs), by_capture(pairs, False)) for name, _, prediction, pairs in rows]
+    lines = [(name, prediction, means(pairs), each_capture(pairs, False)) for name, _, prediction, pairs in rows]
     return table(("idea, and how it was built", "prediction", "mean", "each capture"), lines)
 
 

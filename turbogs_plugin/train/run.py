@@ -203,7 +203,6 @@ def train(
             held.enter_context(folder.replaced())
         if ranks.first:
             held.enter_context(folder.owned(new=True))
-        if ranks.first:
             resolved, told = loop.trainer.config, [*scene.notes, plan.text()]
             if seconds := resolved.budget.seconds():
                 told.append(f"{seconds:g} s of training: about {resolved.train.iterations} iterations")
