@@ -21,7 +21,6 @@ DEARER = 1.1
 BOUND = 0.3
 """dB by which `turbogs-paper` may end below 3DGS at its full length."""
 
-
 Pairs = dict[str, tuple[Cells, Cells]]
 """Capture -> trainings with a part and without it."""
 

@@ -104,7 +104,8 @@ def table(head: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
 
 def by_capture(head: str, lines: Mapping[str, Mapping[str, str]]) -> str:
     """A table with a column a capture, of rows that have a cell for some captures."""
-    captures = dict.fromkeys((*CAPTURES, *(capture for cells in lines.values() for capture in cells)))
+    found = [capture for cells in lines.values() for capture in cells]
+    captures = sorted(set(found), key=[*CAPTURES, *found].index)
     return table((head, *captures), [[name, *(cells.get(of, "") for of in captures)] for name, cells in lines.items()])
 
 
