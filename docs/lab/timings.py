@@ -110,13 +110,13 @@ def dropin() -> str:
     """Variants of examples/simple_trainer/compare.py, means over seeds; and beside stock at the earlier end."""
     parts = []
     for record in sorted((read_json(file.name) for file in LAB.glob("dropin*.json")), key=lambda of: of["date"]):
-        runs: dict[tuple[str, str], list[list[dict[str, float]]]] = {}
+        runs: dict[tuple[str, str, float], list[list[dict[str, float]]]] = {}
         for run in record["runs"]:
-            runs.setdefault((run["scene"], run["variant"]), []).append(run["marks"])
-        lines = []
-        for (scene, variant), seeds in runs.items():
+            runs.setdefault((run["scene"], run["variant"], run["marks"][-1]["step"]), []).append(run["marks"])
+        lines, stocks = [], {scene: seeds for (scene, variant, _), seeds in runs.items() if variant == "stock"}
+        for (scene, variant, _), seeds in runs.items():
             end, beside = {name: statistics.fmean(marks[-1][name] for marks in seeds) for name in seeds[0][-1]}, ""
-            if variant != "stock" and (stock := runs.get((scene, "stock"))):
+            if variant != "stock" and (stock := stocks.get(scene)):
                 seconds = min(end["seconds"], stock[0][-1]["seconds"])
                 ours, theirs = (statistics.fmean(psnr_at(marks, seconds) for marks in of) for of in (seeds, stock))
                 beside = f"{ours - theirs:+.2f} dB: {ours:.2f} for {theirs:.2f} at {seconds:.0f} s"
