@@ -8,18 +8,13 @@ import os
 import secrets
 import socket
 import tempfile
-import threading
 from collections.abc import Callable, Container, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.yaml_json import require_json_size
-
-PAUSE = 0.02
-"""Seconds between two times that a large file is brought to the disk while it is written."""
 
 
 def require_writable(folder: Path, given: str) -> None:
@@ -70,7 +65,7 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
-def write_atomically(path: Path, write: Callable[[BinaryIO], object], large: bool = False) -> None:
+def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Write a new file of a random name beside its destination, bring it to the disk, and put it in place by one
     rename, which replaces a link and follows none.
 
@@ -80,7 +75,6 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object], large: boo
     Args:
         path: the destination; its folder exists.
         write: is given the open file.
-        large: a thread brings it to the disk while it is written, so that less is left to wait for.
 
     Raises:
         OSError: from the disk, with the name of the file; then nothing is left behind.
@@ -92,8 +86,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object], large: boo
     temporary = path.with_name(f"{prefix}{os.getpid()}.{secrets.token_hex(8)}.part")
     try:
         with naming(path), open(temporary, "xb") as file:
-            with _brought_to_disk(file) if large else nullcontext():
-                write(file)
+            write(file)
             file.flush()
             os.fsync(file.fileno())
         with naming(path):
@@ -123,24 +116,6 @@ def new_file(path: Path) -> BinaryIO:
     """A new file in the place of any file or link that is there, for pictures, which need not be whole."""
     path.unlink(missing_ok=True)
     return open(path, "xb")
-
-
-@contextmanager
-def _brought_to_disk(file: BinaryIO) -> Iterator[None]:
-    """While entered, a thread brings what is written of a file to the disk. Leaving raises its `OSError`."""
-    bring, ended = getattr(os, "fdatasync", os.fsync), threading.Event()
-
-    def repeat() -> None:
-        while not ended.wait(PAUSE):
-            bring(file.fileno())
-
-    with ThreadPoolExecutor(1) as pool:
-        repeated = pool.submit(repeat)
-        try:
-            yield
-        finally:
-            ended.set()
-    repeated.result()  # a failure that was told here is not told again at the end
 
 
 def unused_name(name: str, taken: Container[str]) -> str:

@@ -1,10 +1,8 @@
 """Checkpoints: never half-written, never executed."""
 
-import errno
 import os
 import pickle
 import resource
-import threading
 import zipfile
 from contextlib import nullcontext
 from pathlib import Path
@@ -158,27 +156,3 @@ def test_processes_that_write_the_same_file_do_not_meet(tmp_path, monkeypatch):
 
     files.write_atomically(target, write_while_another_does)
     assert target.read_text() == "mine" and os.listdir(tmp_path) == ["results.json"]
-
-
-@pytest.mark.skipif(not hasattr(os, "fdatasync"), reason="this system has no fdatasync")
-def test_a_large_file_is_brought_to_the_disk_while_it_is_written(tmp_path, monkeypatch):
-    """And a failure that only this tells, as systems tell each once, leaves the old file."""
-    target, brought, bring = tmp_path / "model", threading.Event(), os.fdatasync
-
-    def write(file):
-        file.write(b"new")
-        assert brought.wait(60)
-
-    monkeypatch.setattr(os, "fdatasync", lambda descriptor: (bring(descriptor), brought.set()))
-    files.write_atomically(target, write, large=True)
-
-    def full(descriptor):
-        brought.set()
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    brought.clear()
-    monkeypatch.setattr(os, "fdatasync", full)
-    with pytest.raises(OSError, match="No space left") as failed:
-        files.write_atomically(target, lambda file: (write(file), file.write(b"er")), large=True)
-    assert failed.value.filename == str(target)
-    assert target.read_bytes() == b"new" and os.listdir(tmp_path) == ["model"]

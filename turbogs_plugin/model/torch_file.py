@@ -62,7 +62,7 @@ def read_plain(path: Path, name: str, remedy: str = "") -> Any:
 def save_plain(path: Path, state: Any) -> None:
     """`torch.save` into a file that is written whole or not at all. Raises `OSError` if the disk refused."""
     try:
-        write_atomically(path, lambda file: torch.save(_alone(state), file), large=True)
+        write_atomically(path, lambda file: torch.save(_alone(state), file))
     except RuntimeError as error:  # of torch, about positions in the file
         cause = error.__context__
         raise cause if isinstance(cause, OSError) else OSError(str(error).splitlines()[0]) from error
