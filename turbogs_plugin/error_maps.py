@@ -195,17 +195,19 @@ class ErrorMaps:
         """
         return np.maximum(self._means.read(), 0.0) / self._pixel_counts
 
-    def state_dict(self) -> dict[str, Any]:
-        """Plain tensors and numbers; a resume from them gives the same bits."""
-        errors, stamps = self._copies()
+    def state_dict(self, pixels: bool = True) -> dict[str, Any]:
+        """Plain tensors and numbers; a resume from them gives the same bits. Without `pixels`: `view_means` alone."""
+        errors, stamps = self._copies() if pixels else (array[:0].clone() for array in self._arrays)
         state = {"errors": errors, "stamps": stamps, "stamp_base": self.stamp_base}
         return {**state, "view_sums": self.view_sums.clone(), **self._means.state_dict()}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, Any], pixels: bool = True) -> None:
         """Load a saved state. Raises `ValueError` where its numbers are none of maps."""
-        if min(state["stamp_base"], *(state[name].min() for name in ("errors", "view_sums", "mean_values"))) < 0:
+        names = ("view_sums", "mean_values", *(["errors"] if pixels else []))
+        if min(state["stamp_base"], *(state[name].min() for name in names)) < 0:
             raise ValueError("an error of the maps, or the iteration of their stamps, is negative")
-        self._load(state["errors"], state["stamps"])
+        if pixels:
+            self._load(state["errors"], state["stamps"])
         self.stamp_base = int(state["stamp_base"])
         self.view_sums.copy_(state["view_sums"])
         self._means.load_state_dict(state)

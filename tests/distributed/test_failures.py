@@ -106,23 +106,26 @@ def test_a_run_goes_on_with_another_number_of_processes(capture, tmp_path):
     of_two = tmp_path / "run"
     assert [evaluation.iteration for evaluation in read_history(of_two / "history.jsonl")] == [0, 7, 14]
     assert (of_two / "model.ply").is_file() and (of_two / "wall.json").is_file()
-    finals = {}
+    later, finals = {}, {}
     for count in (1, 2, 4):
         folder = tmp_path / str(count)
         shutil.copytree(of_two, folder / "run")
         (folder / "run/checkpoints/iteration-000014.pt").unlink()
+        config = folder / "run/config.yaml"
+        config.write_text(config.read_text().replace("checkpoint_every: 10", "checkpoint_every: 13"))
         if count == 1:
             run.resume(folder / "run")
         else:
             codes, text = trained(count, folder, capture)
             assert codes == [0] * count, text
-        finals[count] = load_checkpoint(latest_checkpoint(folder / "run/checkpoints"))["trainer"]
-        assert finals[count]["iteration"] == 14
+        later[count], finals[count] = (
+            load_checkpoint(folder / f"run/checkpoints/iteration-0000{number}.pt")["trainer"] for number in (13, 14)
+        )
     whole = load_checkpoint(latest_checkpoint(of_two / "checkpoints"))["trainer"]
     assert_identical(finals[2], whole)
     for count in (1, 4):
         assert len(finals[count]["gaussians"]["means"]) == len(whole["gaussians"]["means"])
-        assert torch.equal(finals[count]["maps"]["stamps"], whole["maps"]["stamps"])
+        assert torch.equal(later[count]["maps"]["stamps"], later[2]["maps"]["stamps"])
 
 
 @pytest.mark.parametrize("seed", [1, 4, 5])  # exchanges 8, 15 and 39

@@ -77,6 +77,9 @@ def test_a_watched_training_ends_as_an_unwatched_one(unwatched, watched, monkeyp
     assert len(page.pictures) >= loop.trainer.iteration > 10 and len({frame.tobytes() for frame in page.pictures}) > 6
     assert_identical(loop.trainer.state_dict(), unwatched)
     assert any("Gaussians" in text and "iteration" in text for text in page.said)
+    assert live._state().maps is not None
+    live.watch(SimpleNamespace(trainer=loop.trainer, test=live._capture.test))  # as after a resume at the end
+    assert live._state().maps is None
 
 
 def test_nothing_is_drawn_or_kept_while_nobody_looks(watched, monkeypatch):

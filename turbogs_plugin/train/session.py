@@ -158,7 +158,7 @@ class RunSession(Listener):
 
     def state_dict(self) -> dict[str, Any]:
         return {
-            "trainer": self.trainer.state_dict(),
+            "trainer": self.trainer.state_dict(ended=self.loop.finished),
             "train_seconds": self.loop.clock.seconds,
             "pace": self.loop.pace.state_dict(),
             **capture_state(self.scene),

@@ -34,8 +34,8 @@ from turbogs_plugin.train.parameter_mean import ParameterMean
 from turbogs_plugin.train.saved_model import load_given
 from turbogs_plugin.types import Gaussians, PixelSamples, RowUpdate, Step
 
-STATEFUL = ("maps", "view_sampler", "optimizer", "density")
-"""Attributes that have a state of their own."""
+STATEFUL = ("view_sampler", "optimizer", "density")
+"""Strategies that have a state of their own."""
 COLOR_STRIDE = 97
 """Pixels from one that counts to the next in the mean colour of the photos; coprime to usual widths."""
 
@@ -207,9 +207,10 @@ class TrainingState:
         if 0 < self.iteration == int(self.nonfinite_losses):
             raise TrainingStopped(f"iteration {self.iteration}: no loss was finite: see {type(self.loss).__name__}")
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self, ended: bool = False) -> dict[str, Any]:
         """Everything that iterations change, as plain tensors and numbers. A resume from it is bit for bit the same on
-        a CPU: all randomness is a function of (seed, iteration, place) (`turbogs_plugin.engine.reference.philox`)."""
+        a CPU: all randomness is a function of (seed, iteration, place) (`turbogs_plugin.engine.reference.philox`). Of a
+        run that has `ended`: without what further iterations alone would read, moments and the maps' pixels."""
         return {
             "iteration": self.iteration,
             "initial_error": self.initial_error,
@@ -217,7 +218,8 @@ class TrainingState:
             "gaussians": dict(self.gaussians.items()),
             **({} if self.exposures is None else {"exposures": self.exposures.state_dict()}),
             **({} if self.parameter_mean is None else {"parameter_mean": self.parameter_mean.state_dict()}),
-            **{name: getattr(self, name).state_dict() for name in STATEFUL},
+            "maps": self.maps.state_dict(pixels=not ended),
+            **{name: None if ended else getattr(self, name).state_dict() for name in STATEFUL},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -227,6 +229,8 @@ class TrainingState:
             raise ValueError(f"iteration {state['iteration']} with {state['nonfinite_losses']} non-finite losses")
         if state["maps"]["stamp_base"] > state["iteration"]:
             raise ValueError(f"its error maps begin at iteration {state['maps']['stamp_base']}")
+        if (ended := state["optimizer"] is None) and state["iteration"] < self.iterations:
+            raise ValueError("it lacks what further iterations read")
         self.iteration = self._earliest = state["iteration"]
         self.initial_error = state["initial_error"]
         self.nonfinite_losses.fill_(state["nonfinite_losses"])
@@ -236,7 +240,8 @@ class TrainingState:
             self.exposures.load_state_dict(state["exposures"])
         if self.parameter_mean is not None:
             self.parameter_mean.load_state_dict(state["parameter_mean"], self.device)
-        for name in STATEFUL:
+        self.maps.load_state_dict(state["maps"], pixels=not ended)
+        for name in () if ended else STATEFUL:
             getattr(self, name).load_state_dict(state[name])
 
 

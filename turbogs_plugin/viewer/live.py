@@ -37,6 +37,7 @@ class LiveViewer(Listener):
         self.trainer = session.trainer
         self.trainer.on_samples = self.sampled
         self._capture = CaptureViews(self.trainer.views, session.test)
+        self._ended = self.trainer.iteration == self.trainer.iterations  # the last checkpoint has no maps
         self.page.show_capture(self._capture)
         return self
 
@@ -82,4 +83,5 @@ class LiveViewer(Listener):
         trainer = self.trainer
         synchronize(trainer.device)  # waiting for the iterations before is no cost of a frame
         look = Look(trainer.sh_degree, trainer.config.raster, trainer.background.evaluated)
-        return ModelState(trainer.gaussians, look, self._capture, (trainer.maps, trainer.now), self._samples)
+        maps = None if self._ended else (trainer.maps, trainer.now)
+        return ModelState(trainer.gaussians, look, self._capture, maps, self._samples)
