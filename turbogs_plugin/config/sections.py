@@ -105,8 +105,8 @@ class TrainConfig:
         average_last: share of the iterations, at the end of the run and since the last change of the set of Gaussians,
             whose mean the model becomes (`turbogs_plugin.train.parameter_mean`). 0: the model of the last iteration.
         evaluate_at: times of evaluations, as fractions of T; the start and the end are always evaluated.
-        checkpoint_every: iterations between checkpoints, which a few minutes of training end, too; the end always has
-            one. 0: only the end.
+        checkpoint_every: most iterations between checkpoints. 200 s of training end in one, too, and so does the run; a
+            stop (Ctrl-C) writes one. 0: only the end.
     """
 
     iterations: int | Auto = 5000
@@ -131,7 +131,7 @@ class TrainConfig:
     camera_clearance: bool = False
     average_last: float = 0.0
     evaluate_at: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-    checkpoint_every: int = 10_000
+    checkpoint_every: int = 30_000
 
     def __post_init__(self) -> None:
         countable = isinstance(self.iterations, str) or 1 <= self.iterations < 2**31
