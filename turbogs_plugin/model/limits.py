@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -36,20 +36,18 @@ class Clearance:
     radii: Tensor
 
     @classmethod
-    @torch.no_grad()
     def of(cls, points: Tensor, centers: Tensor) -> Clearance | None:
         """The spheres of a capture with points [M, 3], on the device of `centers` [V, 3]; None where it has fewer than
         `POINTS` points."""
         if len(points) < POINTS:
             return None
-        points = points[:: -(-len(points) // POINTS_LOOKED_AT)]
-        nearest = centers.new_full((POINTS, len(centers)), torch.inf)
-        of_points = []
-        for distances in _distances(points, centers):
-            of_points.append(distances.amin(dim=1))
-            nearest = torch.cat([nearest, distances]).topk(POINTS, dim=0, largest=False).values  # [POINTS, V]
-        rare = torch.cat(of_points).kthvalue(max(1, int(RARE * len(points)))).values
-        return cls(centers, (SHARE * nearest.amax(dim=0)).clamp(max=rare))
+        from scipy.spatial import cKDTree
+
+        places, cameras = points[:: -(-len(points) // POINTS_LOOKED_AT)].cpu().numpy(), centers.cpu().numpy()
+        to_points = cKDTree(places).query(cameras, POINTS)[0][:, -1]  # [V]
+        to_cameras, rank = cKDTree(cameras).query(places, workers=-1)[0], max(1, int(RARE * len(places))) - 1
+        radii = np.minimum(SHARE * to_points, np.partition(to_cameras, rank)[rank])
+        return cls(centers, torch.from_numpy(radii).to(centers))
 
     @torch.no_grad()
     def clear(self, update: RowUpdate, gaussians: Gaussians) -> RowUpdate:
@@ -57,18 +55,14 @@ class Clearance:
         means, reach = update.new("means", gaussians), self.radii.amax()
         low, high = self.centers.amin(dim=0) - reach, self.centers.amax(dim=0) + reach
         among = ((means > low) & (means < high)).all(dim=1).nonzero()[:, 0]  # the cameras: others are in no sphere
-        inside = [(distances < self.radii).any(dim=1) for distances in _distances(means[among], self.centers)]
+        parts = means[among].split(max(1, DISTANCES_AT_ONCE // max(1, len(self.centers))))
+        # By differences: cdist takes a block of threads for each number.
+        inside = [((part[:, None] - self.centers).norm(dim=-1) < self.radii).any(dim=1) for part in parts]
         cleared = among[torch.cat(inside)]
         if len(cleared) == 0:
             return update
         free = torch.ones(len(means), dtype=torch.bool, device=means.device).index_fill_(0, cleared, False)
         return replace(update.taking(free.nonzero()[:, 0]), num_pruned=update.num_pruned + len(cleared))
-
-
-def _distances(points: Tensor, centers: Tensor) -> Iterator[Tensor]:
-    """[n, V] distances, part by part. By differences: cdist takes a block of threads for each number."""
-    for part in points.split(max(1, DISTANCES_AT_ONCE // max(1, len(centers)))):
-        yield (part[:, None] - centers).norm(dim=-1)
 
 
 @torch.no_grad()

@@ -16,7 +16,7 @@ def camera_centers(viewmats: np.ndarray) -> np.ndarray:
 
 def evenly(count: int, most: int) -> list[int]:
     """At most `most` of `count` views, evenly spread, ascending; with the first and the last where there are two."""
-    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()
+    return np.linspace(0, count - 1, min(most, count)).round().astype(int).tolist()
 
 
 def viewmat_of_pose(axes: np.ndarray, center: np.ndarray) -> np.ndarray:
@@ -72,8 +72,8 @@ def mean_neighbor_distances(points: Tensor, neighbors: int) -> Tensor:
     fewer). Points are finite, and may coincide."""
     from scipy.spatial import cKDTree
 
-    places = points.cpu()
-    _, nearest = cKDTree(places.numpy()).query(places.numpy(), min(neighbors + 1, len(places)), workers=-1)
-    # In the points' own precision. The first is the point itself, or another one in its place.
-    x, y, z = ((places[:, None, axis] - places[nearest][:, :, axis]).square() for axis in range(3))
-    return (x + y + z).sort(dim=1).values[:, 1:].sqrt().mean(dim=1).to(points.device)
+    tree, means = cKDTree(points.cpu().numpy()), np.empty(len(points))
+    order = tree.indices  # leaf by leaf: what is near in space is looked for one after the other
+    distances, _ = tree.query(tree.data[order], min(neighbors + 1, len(points)), workers=-1)
+    means[order] = distances[:, 1:].mean(axis=1)  # the first is the point itself, or another one in its place
+    return points.new_tensor(means)

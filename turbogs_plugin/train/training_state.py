@@ -89,7 +89,7 @@ class TrainingState:
             self.depths = InverseDepths.of(scene.train.cameras, scene.train.observations, scene.points, maps).to(device)
         self.clearance: Clearance | None = None
         if train.camera_clearance and not scene.drawn_points:
-            self.clearance = Clearance.of(scene.points.to(device), self.views.cameras.centers)
+            self.clearance = Clearance.of(scene.points, self.views.cameras.centers)
         gaussians = initial_gaussians(scene, config, "points" if resuming else train.init)
         self.begin_with(gaussians.map(lambda tensor: tensor.to(device)))
         self.parameter_mean = ParameterMean(train.average_last, self.learnt()) if train.average_last else None
@@ -263,7 +263,7 @@ def initial_gaussians(scene: Scene, config: Config, init: str) -> Gaussians:
         raise InputError(f"density.max_gaussians {cap} leaves no room beside the {others} of the backdrop: {remedy}")
     if cloud := _cloud(scene, config, init):
         points, colors = cloud
-        rows = evenly(len(points), cap - others if cap else len(points))
+        rows = torch.tensor(evenly(len(points), cap - others if cap else len(points)))
         settings = (train.sh_degree, scene.extent, train.initial_opacity, train.initial_size)
         gaussians = gaussians_from_points(points[rows], colors[rows], *settings)
     else:

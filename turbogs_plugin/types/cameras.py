@@ -83,7 +83,7 @@ class Cameras:
     def centers(self) -> Tensor:
         """[C, 3] camera centres in the world."""
         rotations, translations = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
-        return -(rotations.transpose(1, 2) @ translations[:, :, None])[:, :, 0]
+        return -(rotations * translations[:, :, None]).sum(dim=1)  # a product of matrices would start cuBLAS
 
     @property
     def directions(self) -> Tensor:
