@@ -19,6 +19,7 @@ from torch import Tensor
 
 from turbogs_plugin.scene import PosedImages
 from turbogs_plugin.scene.sequence import neighbours
+from turbogs_plugin.types import Cameras
 
 POINTS_AT_MOST = 2000
 """3D points examined."""
@@ -37,6 +38,8 @@ DARKEST, BRIGHTEST = 0.02, 0.98
 """Mean colours of a patch, 0 .. 1: beyond, what a gain does to it is lost in steps of 255 or cut off."""
 PATCHES_OF_A_PHOTO, PATCHES_AT_MOST = 400, 200_000
 """Patches examined, about: of a photo in the mean, and of all photos."""
+BLOCK = 4096
+"""Patches that are cut at a time, as many as the processor's cache has room for."""
 LUMINANCE = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 ROUNDS, SMALLEST_RESIDUAL = 10, 0.01
 """Rounds of reweighted least squares, and the residual in stops below which all pairs weigh the same."""
@@ -64,10 +67,10 @@ class PhotoGains:
 
 
 class _Patches(NamedTuple):
-    """Patches of one photo that can be compared."""
+    """Patches that can be compared, of all photos."""
 
-    points: Integers
-    """[n] int64, ascending."""
+    rows: Integers
+    """[V, Q] int64, the patch of each point in each photo, -1 where there is none."""
     shapes: Floats
     """[n, 25] float32 luminance, with mean 0 and norm 1."""
     stops: Floats
@@ -79,24 +82,25 @@ def compare_exposures(views: PosedImages, points: Tensor) -> PhotoGains:
     on surfaces (random ones, for want of better), hardly a patch has a match and hardly a photo is compared."""
     count = len(views)
     cameras = views.cameras.to("cpu", torch.float64)
-    patches = _patches(views, points)
+    patches = _patches(views, cameras, points)
     distances = torch.cdist(cameras.centers, cameras.centers, compute_mode="donot_use_mm_for_euclid_dist")
     distances.fill_diagonal_(torch.inf)
-    order = distances.topk(min(CANDIDATES, count - 1), largest=False).indices.tolist() if count > 1 else [[]]
-    ratios: dict[tuple[int, int], tuple[Floats, int]] = {}
-    for view, nearest in enumerate(order):
-        found = 0
-        for other in nearest:
-            pair = min(view, other), max(view, other)
-            if pair not in ratios:
-                ratios[pair] = _compare(patches[pair[0]], patches[pair[1]])
-            found += ratios[pair][1] > 0
-            if found == NEIGHBOURS:
-                break
-    kept = [(pair, ratio, matches) for pair, (ratio, matches) in ratios.items() if matches]
-    pairs = np.array([pair for pair, _, _ in kept], dtype=np.int64).reshape(-1, 2)
-    told = np.array([ratio for _, ratio, _ in kept], dtype=np.float64).reshape(-1, 3)
-    gains = fit_gains(pairs, told, np.sqrt([float(matches) for _, _, matches in kept]), count)
+    nearest = distances.topk(min(CANDIDATES, count - 1), largest=False).indices.numpy()  # [V, CANDIDATES]
+    matches = np.full(count * count, -1)  # behind the ratio of the pair V * first + second; -1: not looked at
+    found = np.zeros(count, dtype=np.int64)
+    parts: list[tuple[Integers, Floats]] = [(found[:0], np.zeros((0, 3)))]
+    for others in nearest.T:
+        seeking = np.flatnonzero(found < NEIGHBOURS)
+        ends = seeking, others[seeking]
+        pairs = count * np.minimum(*ends) + np.maximum(*ends)
+        new = np.unique(pairs[matches[pairs] < 0])
+        ratios, matches[new] = _compare(patches, *np.divmod(new, count))
+        parts.append((new, ratios))
+        found[seeking] += matches[pairs] > 0
+    seen, ratios = (np.concatenate(part) for part in zip(*parts, strict=True))
+    kept = matches[seen] > 0
+    pairs = np.stack(np.divmod(seen[kept], count), axis=1)  # [E, 2]
+    gains = fit_gains(pairs, ratios[kept], np.sqrt(matches[seen[kept]]), count)
     compared = np.bincount(pairs.reshape(-1), minlength=count) > 0  # [V]
     names = [views.names[view] for view in np.flatnonzero(compared)]
     among, near = gains[compared], neighbours(views.names, names, names)
@@ -107,83 +111,85 @@ def compare_exposures(views: PosedImages, points: Tensor) -> PhotoGains:
 def fit_gains(pairs: Integers, ratios: Floats, weights: Floats, count: int) -> Floats:
     """[V, 3] gains g with the least sum of ``weight * |g[first] - g[second] - ratio|``, about, over pairs [E, 2] with
     ratios [E, 3], in stops, and weights [E] > 0. Their mean is 0 in every part of the V photos that pairs connect."""
-    from scipy.sparse import csr_matrix, diags
-    from scipy.sparse.linalg import lsqr
+    from scipy.sparse import csc_matrix, diags
+    from scipy.sparse.csgraph import connected_components
+    from scipy.sparse.linalg import splu
 
     signs, rows = np.tile([1.0, -1.0], len(pairs)), np.repeat(np.arange(len(pairs)), 2)
-    differences = csr_matrix((signs, (rows, pairs.reshape(-1))), shape=(len(pairs), count))
+    differences = csc_matrix((signs, (rows, pairs.reshape(-1))), shape=(len(pairs), count))
+    _, parts = connected_components(differences.T @ differences, directed=False)
+    # The first photo of each part has the gain 0 until the mean has: else the equations leave a constant open.
+    first = diags(1.0 * np.bincount(np.unique(parts, return_index=True)[1], minlength=count))
     gains: Floats = np.zeros((count, 3))
     for _ in range(ROUNDS if len(pairs) else 0):
         residuals = np.linalg.norm(differences @ gains - ratios, axis=1)
-        roots = np.sqrt(weights / np.maximum(SMALLEST_RESIDUAL, residuals))  # [E]
-        weighted = diags(roots) @ differences
-        # Of all solutions the smallest, whose means are 0.
-        gains = np.stack([lsqr(weighted, roots * ratios[:, channel])[0] for channel in range(3)], axis=1)
-    return gains
+        weighted = differences.T @ diags(weights / np.maximum(SMALLEST_RESIDUAL, residuals))
+        gains = splu((weighted @ differences + first).tocsc()).solve(weighted @ ratios)
+    return gains - np.stack([(np.bincount(parts, each) / np.bincount(parts))[parts] for each in gains.T], axis=1)
 
 
-def _compare(first: _Patches, second: _Patches) -> tuple[Floats, int]:
-    """[3] median of first over second, in stops, and the number of patches behind it; 0 where these are too few."""
-    _, here, there = np.intersect1d(first.points, second.points, assume_unique=True, return_indices=True)
-    ours, others = first.shapes[here], second.shapes[there]  # [n, 25]
-    others_of = np.roll(others, len(others) // 2, axis=0)  # of different points
-    alike, by_chance = ((ours * each).sum(axis=1) >= LIKENESS for each in (others, others_of))  # [n]
-    if alike.sum() < max(FEWEST_MATCHES, TIMES_CHANCE * by_chance.sum()):
-        return np.zeros(3), 0
-    return np.median(first.stops[here[alike]] - second.stops[there[alike]], axis=0), int(alike.sum())
+def _compare(patches: _Patches, first: Integers, second: Integers) -> tuple[Floats, Integers]:
+    """Of pairs of photos, [E] each: [E, 3] medians of first over second, in stops, and [E] the numbers of patches
+    behind them; 0 where these are too few."""
+    rows, count = (patches.rows[first], patches.rows[second]), len(first)  # [E, Q]
+    places = np.nonzero((rows[0] >= 0) & (rows[1] >= 0))  # [n], of each point that both photos show
+    pair, here, there = places[0], rows[0][places], rows[1][places]
+    shared = np.bincount(pair, minlength=count)
+    starts = (np.cumsum(shared) - shared)[pair]
+    other = there[starts + (np.arange(len(pair)) - starts - shared[pair] // 2) % shared[pair]]  # of different points
+    ours, theirs, others = (patches.shapes.take(each, axis=0) for each in (here, there, other))  # [n, 25]
+    alike, by_chance = (np.einsum("np,np->n", ours, each) >= LIKENESS for each in (theirs, others))  # [n]
+    matches, chance = (np.bincount(pair[each], minlength=count) for each in (alike, by_chance))
+    matches[matches < np.maximum(FEWEST_MATCHES, TIMES_CHANCE * chance)] = 0
+    kept = alike & (matches[pair] > 0)
+    told = patches.stops[here[kept]] - patches.stops[there[kept]]
+    ratios, ordered = np.zeros((count, 3)), np.stack([each[np.lexsort((each, pair[kept]))] for each in told.T], axis=1)
+    lower, upper = ((np.cumsum(matches) - matches + (matches - odd) // 2)[matches > 0] for odd in (1, 0))
+    ratios[matches > 0] = 0.5 * (ordered[lower] + ordered[upper])
+    return ratios, matches
 
 
-def _sight(views: PosedImages, points: Tensor) -> tuple[Tensor, Tensor]:
-    """[V, Q] bool, which of some of the points are in front of each camera, within its photo and not masked; and
-    [V, Q] int64, their flat pixels, 0 where they are not inside."""
-    cameras = views.cameras.to("cpu", torch.float64)
-    chosen = points[:: max(1, -(-len(points) // POINTS_AT_MOST))].cpu().double()  # [Q, 3]
-    seen = chosen @ cameras.viewmats[:, :3, :3].transpose(1, 2) + cameras.viewmats[:, None, :3, 3]  # [V, Q, 3]
-    depths = seen[..., 2]
-    pixels = (seen @ cameras.Ks.transpose(1, 2))[..., :2] / depths.clamp(min=1e-9)[..., None]
-    sizes = torch.from_numpy(cameras.sizes)[:, None]  # [V, 1, 2]
-    inside = (depths > 1e-9) & (pixels >= 0).all(dim=-1) & (pixels < sizes).all(dim=-1)
-    x, y = torch.where(inside[..., None], pixels, 0.0).long().unbind(dim=-1)
+def _patches(views: PosedImages, cameras: Cameras, points: Tensor) -> _Patches:
+    chosen = points[:: max(1, -(-len(points) // POINTS_AT_MOST))].cpu().double().numpy()  # [Q, 3]
+    matrices, (widths, heights) = (cameras.Ks @ cameras.viewmats[:, :3]).numpy(), cameras.sizes.T[:, :, None]
+    x, y, depths = (matrices[:, :, :3] @ chosen.T + matrices[:, :, 3:]).swapaxes(0, 1)  # [V, Q] each
+    x, y = x / np.maximum(depths, 1e-9), y / np.maximum(depths, 1e-9)
+    inside = (depths > 1e-9) & (x >= 0) & (y >= 0) & (x < widths) & (y < heights)
+    x, y = (np.where(inside, each, 0.0).astype(np.int64) for each in (x, y))
     if views.masks is not None:
-        inside &= torch.stack([views.masks.image(view)[y[view], x[view]] for view in range(len(views))])
-    flat = torch.from_numpy(views.photos.offsets[:-1])[:, None] + y * sizes[..., 0] + x
-    return inside, torch.where(inside, flat, 0)
-
-
-def _patches(views: PosedImages, points: Tensor) -> list[_Patches]:
-    inside, flats = _sight(views, points)
+        inside &= np.stack([views.masks.image(view).numpy()[y[view], x[view]] for view in range(len(views))])
     every = -(-int(inside.sum()) // min(PATCHES_AT_MOST, PATCHES_OF_A_PHOTO * len(views))) or 1
-    axes = _axes_in_photos(views)
-    stored, offsets = views.photos.stored, views.photos.offsets
+    inside, x, y = inside[:, ::every], x[:, ::every], y[:, ::every]
     grid = np.stack(np.meshgrid(*[np.arange(-RADIUS, RADIUS + 1)] * 2), axis=-1).reshape(-1, 2)  # [25, 2]
-    patches = []
-    for view, (width, height) in enumerate(views.photos.sizes.tolist()):
-        shown = every * torch.nonzero(inside[view, ::every])[:, 0]
-        flat = (flats[view, shown] - int(offsets[view])).numpy()
-        (x, y), step = axes[view], max(1.0, max(width, height) / STEPS)
-        turned = np.rint(step * grid @ np.array([[x, y], [-y, x]])).astype(np.int64)  # [25, 2]
-        places = np.stack([flat % width, flat // width], axis=1)[:, None] + turned  # [n, 25, 2]
-        whole = ((places >= 0) & (places < (width, height))).all(axis=(1, 2))
-        pixels = torch.from_numpy(int(offsets[view]) + places[whole] @ np.array([1, width]))
-        colors = stored.index_select(0, pixels.flatten().to(stored.device)).view(*pixels.shape, stored.shape[1])
-        patches.append(_comparable(shown.numpy()[whole], colors[..., :3].cpu().numpy() / np.float32(255.0)))
-    return patches
+    steps, (right, down) = np.maximum(1.0, cameras.sizes.max(axis=1) / STEPS), _axes_in_photos(cameras).T
+    turns = np.array([[right, down], [-down, right]]).transpose(2, 0, 1)  # [V, 2, 2]
+    across, along = np.rint(steps[:, None, None] * grid @ turns).astype(np.int64).transpose(2, 0, 1)  # [V, 25] each
+    for place, moves, ends in ((x, across, widths), (y, along, heights)):
+        inside &= (place >= -moves.min(axis=1, keepdims=True)) & (place < ends - moves.max(axis=1, keepdims=True))
+    view, point = np.nonzero(inside)  # [n]
+    middles, around = views.photos.offsets[view] + (y * widths + x)[inside], along * widths + across
+    stored, rows = views.photos.stored.cpu().numpy(), np.full(inside.shape, -1)
+    blocks = (slice(start, start + BLOCK) for start in range(0, max(1, len(view)), BLOCK))
+    cut = (stored.take(middles[block, None] + around[view[block]], axis=0) for block in blocks)  # [b, 25, 3 or 4] each
+    parts = [_comparable(colors[..., :3] / np.float32(255.0)) for colors in cut]
+    usable, shapes, stops = (np.concatenate(part) for part in zip(*parts, strict=True))
+    rows[view[usable], point[usable]] = np.arange(len(shapes))
+    return _Patches(rows, shapes, stops)
 
 
-def _comparable(points: Integers, colors: Floats) -> _Patches:
-    """The patches, of [n, 25, 3], that have texture, and in each channel room for a gain."""
-    means, luminance = colors.mean(axis=1), colors @ LUMINANCE
+def _comparable(colors: Floats) -> tuple[NDArray[np.bool_], Floats, Floats]:
+    """Which of patches [n, 25, 3] have texture, and in each channel room for a gain; shapes and stops of these."""
+    means, luminance = np.einsum("npc->nc", colors) / colors.shape[1], colors @ LUMINANCE
     shapes = luminance - luminance.mean(axis=1, keepdims=True)
-    deviations = np.sqrt((shapes**2).mean(axis=1))
+    deviations = np.sqrt(np.einsum("np,np->n", shapes, shapes) / shapes.shape[1])
     usable = (deviations >= TEXTURE) & ((means > DARKEST) & (means < BRIGHTEST)).all(axis=1)
     shapes = shapes[usable] / (deviations[usable, None] * np.sqrt(shapes.shape[1]))
-    return _Patches(points[usable], shapes, np.log2(means[usable]))
+    return usable, shapes, np.log2(means[usable])
 
 
-def _axes_in_photos(views: PosedImages) -> Floats:
+def _axes_in_photos(cameras: Cameras) -> Floats:
     """[V, 2] a direction of the world as unit vectors in the photos, so that patches of photos that are turned against
     each other (a flight there and back) are turned alike: the direction that the cameras look along least."""
-    cameras = views.cameras.to("cpu", torch.float64)
     directions: Tensor = cameras.directions
     axis = torch.linalg.eigh(directions.T @ directions).eigenvectors[:, 0]
     seen = (cameras.viewmats[:, :2, :3] @ axis).numpy()  # [V, 2]
