@@ -23,7 +23,6 @@ from turbogs_plugin.captures.starting_points import colors_in_photos, starting_p
 from turbogs_plugin.captures.undistort import undistortion_note
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks
-from turbogs_plugin.scene.agreement import MOST_POINTS
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.geometry import camera_centers, seen
 from turbogs_plugin.scene.host_arrays import file_note
@@ -153,8 +152,8 @@ def unseeing_note(scene: Scene) -> str:
     for views in () if scene.drawn_points else (scene.train, scene.test):
         viewmats, Ks = views.cameras.viewmats.cpu().numpy(), views.cameras.Ks.cpu().numpy()
         for name, viewmat, K, size in zip(views.names, viewmats, Ks, views.cameras.sizes, strict=True):
-            steps = max(1, len(points) // MOST_POINTS), 1  # all of them where none of some is seen
-            if not any(len(seen(points[::step], viewmat, K, size)[0]) for step in steps):
+            # All of them where none of some is seen.
+            if not any(len(seen(points[::step], viewmat, K, size)[0]) for step in (256, 16, 1)):
                 blind.append(name)
     return f"{len(blind)} cameras see none of the points: {', '.join(blind[:3])}" if blind else ""
 
