@@ -100,6 +100,7 @@ def load_photos(
     lenses: Sequence[Lens | None],
     channels: int = 3,
     progress: Callable[[int, int], object] | None = None,
+    meanwhile: Callable[[], object] = lambda: None,
 ) -> Photos:
     """Decode V photos in parallel, undistorted, then reduced to their target sizes by area averaging. They are taken as
     stored: an orientation in EXIF is ignored, as COLMAP does.
@@ -110,6 +111,7 @@ def load_photos(
         channels: 3, where photos that are transparent lose their alpha and keep their colours as stored; or 4, where
             3 are kept after all if every pixel is opaque.
         progress: called with the number of photos decoded so far, and of all.
+        meanwhile: called while threads decode.
 
     Raises:
         InputError: a photo that cannot be decoded, the first one in order; more photos than fit in memory or on disk.
@@ -138,8 +140,10 @@ def load_photos(
 
     opaque = True
     with decoding_threads() as pool:
+        decoded = pool.map(load, range(len(paths)))
+        meanwhile()
         # The first error in order is raised, and ends what was not begun.
-        for count, own in enumerate(pool.map(load, range(len(paths))), start=1):
+        for count, own in enumerate(decoded, start=1):
             opaque &= own
             if progress is not None:
                 progress(count, len(paths))

@@ -67,6 +67,7 @@ def load_scene(
     test_every: int = 8,
     progress: Callable[[int, int], object] | None = None,
     validation: bool = False,
+    meanwhile: Callable[[Scene], object] = lambda scene: None,
 ) -> Scene:
     """Load a capture with its photos.
 
@@ -82,6 +83,7 @@ def load_scene(
             Captures with a split of their own (NeRF-synthetic, lists in a ``transforms.json``) keep it.
         validation: leave the test views out, and test on the first of each `test_every` of the others.
         progress: called with the number of photos decoded so far, and of all.
+        meanwhile: called with the scene while its photos are decoded, without their pixels.
 
     Raises:
         InputError: anything wrong with the scene or the arguments, in one line.
@@ -117,10 +119,15 @@ def load_scene(
     views, count = np.concatenate(parts), len(parts[0])
     paths, lenses = [files[view] for view in views], [capture.lenses[view] for view in views]
     channels = channels_of(paths) if capture.alpha == "opacity" else 3
-    photos = load_photos(paths, sizes[views], lenses, channels, progress)  # in one array: its room is found once
-    first = int(photos.offsets[count])
-    train = _posed(capture, frame, masks, parts[0], Photos(photos.colors[:first], photos.sizes[:count]))
-    tested = _posed(capture, frame, masks, parts[1], Photos(photos.colors[first:], photos.sizes[count:]))
+    train, tested = (_posed(capture, frame, masks, part, sizes[part]) for part in parts)
+    name, given = scene.resolve().name, capture.point_colors
+    colors = torch.zeros_like(points, dtype=torch.uint8) if given is None else torch.from_numpy(given)
+    loaded = Scene(name, train, tested, points, colors, frame, 1.0, given is None, doubt=capture.doubt)
+    # In one array: its room is found once.
+    photos = load_photos(paths, sizes[views], lenses, channels, progress, lambda: meanwhile(loaded))
+    train.photos.colors, tested.photos.colors = photos.colors.tensor_split([int(photos.offsets[count])])
+    if given is None:
+        loaded.point_colors = colors_in_photos(points, train.cameras, train.photos, train.masks)
     notes = (
         *capture.notes,
         size_note,
@@ -130,20 +137,8 @@ def load_scene(
         "transparent photos are composited on a background (train.background)" if train.photos.transparent else "",
         file_note([train.photos.stored, tested.photos.stored], "photos"),
     )
-    given = capture.point_colors
-    shown = train.cameras, train.photos, train.masks
-    return Scene(
-        name=scene.resolve().name,
-        train=train,
-        test=tested,
-        points=points,
-        point_colors=colors_in_photos(points, *shown) if given is None else torch.from_numpy(given),
-        frame=frame,
-        extent=1.0,
-        drawn_points=given is None,
-        doubt=capture.doubt,
-        notes=tuple(filter(None, notes)),
-    )
+    loaded.notes = tuple(filter(None, notes))
+    return loaded
 
 
 def unseeing_note(scene: Scene) -> str:
@@ -152,26 +147,26 @@ def unseeing_note(scene: Scene) -> str:
     for views in () if scene.drawn_points else (scene.train, scene.test):
         viewmats, Ks = views.cameras.viewmats.cpu().numpy(), views.cameras.Ks.cpu().numpy()
         for name, viewmat, K, size in zip(views.names, viewmats, Ks, views.cameras.sizes, strict=True):
-            # All of them where none of some is seen.
-            if not any(len(seen(points[::step], viewmat, K, size)[0]) for step in (256, 16, 1)):
+            if not any(len(seen(points[::step], viewmat, K, size)[0]) for step in (256, 16, 1)):  # some, or all
                 blind.append(name)
     return f"{len(blind)} cameras see none of the points: {', '.join(blind[:3])}" if blind else ""
 
 
 def _posed(
-    capture: Capture, frame: Frame, masks: list[PixelMasks | None], views: np.ndarray, photos: Photos
+    capture: Capture, frame: Frame, masks: list[PixelMasks | None], views: np.ndarray, sizes: np.ndarray
 ) -> PosedImages:
-    """Some views with their photos, cameras for photos of these sizes, masks and what the photos show."""
-    ratios = photos.sizes / capture.sizes[views]
+    """Some views with cameras for photos of these sizes, masks and what the photos show; photos without pixels."""
+    ratios = sizes / capture.sizes[views]
     intrinsics = capture.Ks[views]
     intrinsics[:, :2] *= ratios[:, :, None]
     viewmats = torch.from_numpy(frame.normalise_poses(capture.viewmats[views])).float()
-    cameras = Cameras(viewmats, torch.from_numpy(intrinsics).float(), photos.sizes)
+    cameras = Cameras(viewmats, torch.from_numpy(intrinsics).float(), sizes)
     shown = None if capture.observations is None else capture.observations.of_views(views, ratios)
     own, masked = [masks[view] for view in views], None
     if any(mask is not None for mask in own):
-        pairs = zip(own, photos.sizes[:, ::-1].tolist(), strict=True)  # (height, width)
+        pairs = zip(own, sizes[:, ::-1].tolist(), strict=True)  # (height, width)
         masked = PixelMasks.joined([mask or PixelMasks.of(np.ones(size, dtype=bool)) for mask, size in pairs])
+    photos = Photos(torch.empty(0, 3, dtype=torch.uint8), sizes)
     return PosedImages(cameras, tuple(capture.names[view] for view in views), photos, masked, shown)
 
 

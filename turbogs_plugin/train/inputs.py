@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import torch
 
-from turbogs_plugin.captures.bundle_adjustment import find_cameras, with_cameras
+from turbogs_plugin.captures.bundle_adjustment import RefinedCameras, find_cameras, with_cameras
 from turbogs_plugin.captures.load import load_scene, unseeing_note
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.sections import SceneConfig
@@ -54,8 +54,9 @@ def open_scene(settings: SceneConfig, refine: bool, ranks: Ranks = ONE, trained:
             differ in their last digits, and replicas may not.
         trained: a run has begun on it, so it is not asked again whether training on it can work.
     """
-    progress = show_loading if ranks.first else None
-    scene = load_scene(settings.path, settings.factor, settings.test_every, progress, settings.validation)
+    first, found = ranks.first, list[RefinedCameras | None]()
+    how = settings.factor, settings.test_every, show_loading if first else None, settings.validation
+    scene = load_scene(settings.path, *how, lambda read: found.append(find_cameras(read, refine)) if first else None)
     if not (settings.force or trained):
         require_agreement(scene)
         if scene.drawn_points:
@@ -64,8 +65,7 @@ def open_scene(settings: SceneConfig, refine: bool, ranks: Ranks = ONE, trained:
             require_poses(scene)
     if note := unseeing_note(scene):
         scene = replace(scene, notes=(*scene.notes, note))
-    cameras = find_cameras(scene, refine) if ranks.first else None
-    return with_cameras(scene, ranks.agree(cameras))
+    return with_cameras(scene, ranks.agree(found[0] if found else None))
 
 
 def open_started(
