@@ -130,7 +130,9 @@ def load_photos(
         """Decode a photo; True where it is opaque."""
         target, lens = tuple(targets[view].tolist()), lenses[view]
         with opened_image(paths[view]) as image:
-            photo = (image.convert("RGBA") if channels == 4 or is_transparent(image) else image).convert(mode)
+            image.load()
+            whole = image.convert("RGBA") if channels == 4 or is_transparent(image) else image
+            photo = whole if whole.mode == mode else whole.convert(mode)  # which copies where nothing is to be done
         if lens is not None:
             photo = lens.undistort(photo)
         if photo.size != target:

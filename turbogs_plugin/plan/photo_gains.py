@@ -36,10 +36,8 @@ TEXTURE = 0.01
 """Standard deviation of luminance (0 .. 1) below which a patch looks like any other."""
 DARKEST, BRIGHTEST = 0.02, 0.98
 """Mean colours of a patch, 0 .. 1: beyond, what a gain does to it is lost in steps of 255 or cut off."""
-PATCHES_OF_A_PHOTO, PATCHES_AT_MOST = 400, 200_000
-"""Patches examined, about: of a photo in the mean, and of all photos."""
-BLOCK = 4096
-"""Patches that are cut at a time, as many as the processor's cache has room for."""
+PATCHES_OF_A_PHOTO, PATCHES_AT_MOST, BLOCK = 400, 200_000, 4096
+"""Patches examined, about: of a photo in the mean, and of all photos; patches that a processor's cache has room for."""
 LUMINANCE = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 ROUNDS, SMALLEST_RESIDUAL = 10, 0.01
 """Rounds of reweighted least squares, and the residual in stops below which all pairs weigh the same."""
