@@ -105,7 +105,7 @@ def test_errors_by_refined_test_cameras_stand_beside_the_others(capture):
     scene = refine_cameras(load_scene(capture, factor=8))
     gaussians = gaussians_from_points(scene.points, scene.point_colors, 0, scene.extent)
     look = Look(0, RasterSettings())
-    mean = evaluate(gaussians, scene.test, look, refined=True).mean
+    mean = evaluate(gaussians, scene.test, look, further=True).mean
     moved = evaluate(gaussians, replace(scene.test, cameras=scene.test.refined), look).mean
     assert mean.refined_psnr == moved.psnr != mean.psnr
     assert np.isnan(evaluate(gaussians, scene.test, look).mean.refined_psnr)

@@ -97,7 +97,7 @@ def test_a_saved_run_is_shown_as_its_trainer_is(capture, scene, tmp_path):
     save_checkpoint(outcome.folder.checkpoints, trainer.iteration, state)
     trainer.load_state_dict(state["trainer"])
     look = trainer.look(scene.test.names)
-    metrics = evaluate(trainer.gaussians, scene.test, look).mean
+    metrics = evaluate(trainer.gaussians, scene.test, look, further=True).mean
     table = evaluate_run(run, "cpu")
     for row, value in (("mean of 1", metrics.psnr), ("mean of the model's own colours", metrics.own_psnr)):
         assert metrics.psnr != metrics.own_psnr and re.search(rf"^{row} +{value:.2f} ", table, re.MULTILINE), table
@@ -114,10 +114,10 @@ def test_test_views_are_shown_with_what_their_neighbours_have(scene):
     """Nothing but exposures changes: the model's own colours have the errors that they had."""
     trainer = tiny_trainer(scene, "train.exposure=true")
     views = (trainer.gaussians, scene.test)
-    before = evaluate(*views, trainer.look(scene.test.names)).mean
+    before = evaluate(*views, trainer.look(scene.test.names), further=True).mean
     assert before.psnr == before.own_psnr  # every exposure is the identity
     trainer.exposures.offsets += 0.3
-    after = evaluate(*views, trainer.look(scene.test.names)).mean
+    after = evaluate(*views, trainer.look(scene.test.names), further=True).mean
     assert (after.own_psnr, after.own_ssim, after.own_l1) == (before.psnr, before.ssim, before.l1)
     own = render_image(trainer.gaussians, scene.test.cameras, 0, sh_degree=0, settings=trainer.config.raster).colors
     shown = (own + 0.3 * own.sum(dim=2, keepdim=True) + 0.3).clamp(0.0, 1.0)

@@ -32,7 +32,7 @@ def evaluate_run(path: Path, device_name: str, given: Config | None = None) -> s
     views, look = views_of(model, scene, "test")
     views = place_views(views, model.gaussians.device, model.config.train.pixels_place)
     lpips, reason = load_lpips(model.gaussians.device)
-    metrics = evaluate(model.gaussians, views, look, lpips, refined=True)
+    metrics = evaluate(model.gaussians, views, look, lpips, further=True)
     mean, notes = metrics.mean, explained(metrics) + ([f"LPIPS was not computed: {reason}"] if reason else [])
     if model.folder is not None:
         counts = {"iteration": model.iteration, "num_gaussians": len(model.gaussians), "fps": metrics.fps}

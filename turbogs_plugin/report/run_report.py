@@ -31,7 +31,7 @@ def write_report(run: RunSession) -> Path:
     lpips, lpips_reason = load_lpips(trainer.device)
     metrics = None if lpips else run.evaluations.metrics  # of the end
     if metrics is None:
-        metrics = evaluate(trainer.gaussians, run.test, look, lpips, refined=True)
+        metrics = evaluate(trainer.gaussians, run.test, look, lpips, further=True)
     run.clock.mark("report")
     pictures = run.folder.path / "report"
     pictures.mkdir(exist_ok=True)

@@ -19,9 +19,9 @@ MEASURES = ("psnr", "ssim", "l1")
 
 @dataclass(kw_only=True)
 class FurtherErrors:
-    """Errors beside the plain ones; NaN where they were not computed. `own`: of the model's own colours in runs that
-    learn exposures, where plain ones are of views with the exposures of their neighbours (`interpolated_exposures`).
-    `refined`: by refined cameras of the test photos (`PosedImages.refined`), at the end."""
+    """Errors beside the plain ones, at the end of a run; NaN where they were not computed. `own`: of the model's own
+    colours in runs that learn exposures, where plain ones are of views with the exposures of their neighbours
+    (`interpolated_exposures`). `refined`: by refined cameras of the test photos (`PosedImages.refined`)."""
 
     own_psnr: float = field(default=math.nan, repr=False)
     own_ssim: float = field(default=math.nan, repr=False)

@@ -69,21 +69,21 @@ def evaluate(
     views: PosedImages,
     look: Look,
     lpips: ImageError | None = None,
-    refined: bool = False,
+    further: bool = False,
     view_ids: Sequence[int] | None = None,
 ) -> Metrics:
-    """Render views, one at a time, and compare each with its photo. Where views have exposures, errors of the model's
-    own colours are given beside.
+    """Render views, one at a time, and compare each with its photo.
 
     Args:
         gaussians: the model, on the views' device.
         lpips: from `load_lpips`, if wanted. It sees the photo's pixels where it is masked.
-        refined: where views have refined cameras, give the errors by these cameras, too.
+        further: give the errors by refined cameras and those of the model's own colours, too, where views have refined
+            cameras and exposures.
         view_ids: at least one; None: all.
     """
     metrics: list[ViewMetrics] = []
     seconds = 0.0
-    moved = replace(views, cameras=views.refined) if refined and views.refined is not None else None
+    moved = replace(views, cameras=views.refined) if further and views.refined is not None else None
     for view_id in range(len(views)) if view_ids is None else view_ids:
         name = views.names[view_id]
         synchronize(gaussians.device)
@@ -94,10 +94,10 @@ def evaluate(
         seconds += time.perf_counter() - started
         photo, mask = views.photos.image(view_id, look.background), views.mask(view_id)
         measured = compare(name, image, photo, mask)
-        further = {} if look.exposures is None else {"own": own.clamp(0.0, 1.0)}
+        others = {"own": own.clamp(0.0, 1.0)} if further and look.exposures is not None else {}
         if moved is not None:
-            further["refined"] = render_view(gaussians, moved, view_id, look)
-        for kind, shown in further.items():
+            others["refined"] = render_view(gaussians, moved, view_id, look)
+        for kind, shown in others.items():
             other = compare(name, shown, photo, mask)
             for measure in MEASURES:
                 setattr(measured, f"{kind}_{measure}", getattr(other, measure))
@@ -184,7 +184,7 @@ class Evaluations(Listener):
     def evaluation_due(self, loop: TrainingLoop) -> None:
         trainer = loop.trainer
         trainer.require_finite()
-        metrics = evaluate(trainer.gaussians, self.test, trainer.look(self.test.names), refined=loop.finished)
+        metrics = evaluate(trainer.gaussians, self.test, trainer.look(self.test.names), further=loop.finished)
         mean, self.metrics = asdict(metrics.mean), metrics
         evaluation = Evaluation(
             iteration=trainer.iteration,
