@@ -36,8 +36,10 @@ TEXTURE = 0.01
 """Standard deviation of luminance (0 .. 1) below which a patch looks like any other."""
 DARKEST, BRIGHTEST = 0.02, 0.98
 """Mean colours of a patch, 0 .. 1: beyond, what a gain does to it is lost in steps of 255 or cut off."""
-PATCHES_OF_A_PHOTO, PATCHES_AT_MOST, BLOCK = 400, 200_000, 4096
-"""Patches examined, about: of a photo in the mean, and of all photos; patches that a processor's cache has room for."""
+PATCHES_OF_A_PHOTO, PATCHES_AT_MOST = 400, 200_000
+"""Patches examined, about: of a photo in the mean, and of all photos."""
+BLOCK = 4096
+"""Patches cut at a time, which a processor's cache has room for."""
 LUMINANCE = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 ROUNDS, SMALLEST_RESIDUAL = 10, 0.01
 """Rounds of reweighted least squares, and the residual in stops below which all pairs weigh the same."""
@@ -134,35 +136,36 @@ def _compare(patches: _Patches, first: Integers, second: Integers) -> tuple[Floa
     pair, here, there = places[0], rows[0][places], rows[1][places]
     shared = np.bincount(pair, minlength=count)
     starts = (np.cumsum(shared) - shared)[pair]
-    other = there[starts + (np.arange(len(pair)) - starts - shared[pair] // 2) % shared[pair]]  # of different points
+    # Beside each patch, one of another point: half of the pair's points further, round to its first.
+    other = there[starts + (np.arange(len(pair)) - starts - shared[pair] // 2) % shared[pair]]
     ours, theirs, others = (patches.shapes.take(each, axis=0) for each in (here, there, other))  # [n, 25]
     alike, by_chance = (np.einsum("np,np->n", ours, each) >= LIKENESS for each in (theirs, others))  # [n]
     matches, chance = (np.bincount(pair[each], minlength=count) for each in (alike, by_chance))
     matches[matches < np.maximum(FEWEST_MATCHES, TIMES_CHANCE * chance)] = 0
     kept = alike & (matches[pair] > 0)
     told = patches.stops[here[kept]] - patches.stops[there[kept]]
-    ratios, ordered = np.zeros((count, 3)), np.stack([each[np.lexsort((each, pair[kept]))] for each in told.T], axis=1)
-    lower, upper = ((np.cumsum(matches) - matches + (matches - odd) // 2)[matches > 0] for odd in (1, 0))
-    ratios[matches > 0] = 0.5 * (ordered[lower] + ordered[upper])
-    return ratios, matches
+    return _medians(told, pair[kept], matches), matches
+
+
+def _medians(values: Floats, groups: Integers, sizes: Integers) -> Floats:
+    """[E, 3] medians of the columns of [n, 3] in each of E groups, 0 in an empty one. `groups`: [n], ascending;
+    `sizes`: [E]."""
+    ordered = np.stack([column[np.lexsort((column, groups))] for column in values.T], axis=1)
+    medians, filled, starts = np.zeros((len(sizes), 3)), sizes > 0, np.cumsum(sizes) - sizes
+    lower, upper = ((starts + (sizes - odd) // 2)[filled] for odd in (1, 0))
+    medians[filled] = 0.5 * (ordered[lower] + ordered[upper])
+    return medians
 
 
 def _patches(views: PosedImages, cameras: Cameras, points: Tensor) -> _Patches:
-    chosen = points[:: max(1, -(-len(points) // POINTS_AT_MOST))].cpu().double().numpy()  # [Q, 3]
-    matrices, (widths, heights) = (cameras.Ks @ cameras.viewmats[:, :3]).numpy(), cameras.sizes.T[:, :, None]
-    x, y, depths = (matrices[:, :, :3] @ chosen.T + matrices[:, :, 3:]).swapaxes(0, 1)  # [V, Q] each
-    x, y = x / np.maximum(depths, 1e-9), y / np.maximum(depths, 1e-9)
-    inside = (depths > 1e-9) & (x >= 0) & (y >= 0) & (x < widths) & (y < heights)
-    x, y = (np.where(inside, each, 0.0).astype(np.int64) for each in (x, y))
-    if views.masks is not None:
-        inside &= np.stack([views.masks.image(view).numpy()[y[view], x[view]] for view in range(len(views))])
-    every = -(-int(inside.sum()) // min(PATCHES_AT_MOST, PATCHES_OF_A_PHOTO * len(views))) or 1
-    inside, x, y = inside[:, ::every], x[:, ::every], y[:, ::every]
+    """Patches about some of the points, in each photo that shows one, turned as `_axes_in_photos` has it."""
+    inside, x, y = _sight(views, cameras, points)
+    (widths, heights), steps = cameras.sizes.T[:, :, None], np.maximum(1.0, cameras.sizes.max(axis=1) / STEPS)
     grid = np.stack(np.meshgrid(*[np.arange(-RADIUS, RADIUS + 1)] * 2), axis=-1).reshape(-1, 2)  # [25, 2]
-    steps, (right, down) = np.maximum(1.0, cameras.sizes.max(axis=1) / STEPS), _axes_in_photos(cameras).T
+    right, down = _axes_in_photos(cameras).T
     turns = np.array([[right, down], [-down, right]]).transpose(2, 0, 1)  # [V, 2, 2]
     across, along = np.rint(steps[:, None, None] * grid @ turns).astype(np.int64).transpose(2, 0, 1)  # [V, 25] each
-    for place, moves, ends in ((x, across, widths), (y, along, heights)):
+    for place, moves, ends in ((x, across, widths), (y, along, heights)):  # whole patches alone
         inside &= (place >= -moves.min(axis=1, keepdims=True)) & (place < ends - moves.max(axis=1, keepdims=True))
     view, point = np.nonzero(inside)  # [n]
     middles, around = views.photos.offsets[view] + (y * widths + x)[inside], along * widths + across
@@ -173,6 +176,20 @@ def _patches(views: PosedImages, cameras: Cameras, points: Tensor) -> _Patches:
     usable, shapes, stops = (np.concatenate(part) for part in zip(*parts, strict=True))
     rows[view[usable], point[usable]] = np.arange(len(shapes))
     return _Patches(rows, shapes, stops)
+
+
+def _sight(views: PosedImages, cameras: Cameras, points: Tensor) -> tuple[NDArray[np.bool_], Integers, Integers]:
+    """Which of some points each photo shows, and their pixels, x and y: [V, Q] each."""
+    chosen = points[:: max(1, -(-len(points) // POINTS_AT_MOST))].cpu().double().numpy()  # [Q, 3]
+    matrices, (widths, heights) = (cameras.Ks @ cameras.viewmats[:, :3]).numpy(), cameras.sizes.T[:, :, None]
+    x, y, depths = (matrices[:, :, :3] @ chosen.T + matrices[:, :, 3:]).swapaxes(0, 1)  # [V, Q] each
+    x, y = x / np.maximum(depths, 1e-9), y / np.maximum(depths, 1e-9)
+    inside = (depths > 1e-9) & (x >= 0) & (y >= 0) & (x < widths) & (y < heights)
+    x, y = (np.where(inside, each, 0.0).astype(np.int64) for each in (x, y))
+    if views.masks is not None:
+        inside &= np.stack([views.masks.image(view).numpy()[y[view], x[view]] for view in range(len(views))])
+    every = -(-int(inside.sum()) // min(PATCHES_AT_MOST, PATCHES_OF_A_PHOTO * len(views))) or 1
+    return inside[:, ::every], x[:, ::every], y[:, ::every]
 
 
 def _comparable(colors: Floats) -> tuple[NDArray[np.bool_], Floats, Floats]:
