@@ -56,6 +56,20 @@ def test_pixels_are_those_of_undistorted_photos(tmp_path):
     assert median_error(scene, "train") < 3.0, "as without the lens"
 
 
+def test_cameras_are_found_while_photos_are_decoded(capture):
+    """What is called meanwhile has the scene without its photos' pixels, and finds the cameras that it finds after."""
+    found = []
+    scene = load_scene(
+        capture, meanwhile=lambda read: found.append((len(read.train.photos.colors), find_cameras(read)))
+    )
+    ((pixels, meanwhile),) = found
+    assert pixels == 0 < len(scene.train.photos.colors)
+    afterwards = find_cameras(scene)
+    assert all(
+        torch.equal(getattr(meanwhile.train, name), getattr(afterwards.train, name)) for name in ("viewmats", "Ks")
+    )
+
+
 @pytest.mark.parametrize("factor", [1, 2])
 def test_training_cameras_are_refined_and_test_cameras_stay(capture, factor):
     scene = load_scene(capture, factor=factor)
