@@ -120,13 +120,13 @@ def load_scene(
     paths, lenses = [files[view] for view in views], [capture.lenses[view] for view in views]
     channels = channels_of(paths) if capture.alpha == "opacity" else 3
     train, tested = (_posed(capture, frame, masks, part, sizes[part]) for part in parts)
-    name, given = scene.resolve().name, capture.point_colors
+    name, given, drawn = scene.resolve().name, capture.point_colors, capture.point_colors is None
     colors = torch.zeros_like(points, dtype=torch.uint8) if given is None else torch.from_numpy(given)
-    loaded = Scene(name, train, tested, points, colors, frame, 1.0, given is None, doubt=capture.doubt)
+    loaded = Scene(name, train, tested, points, colors, frame, extent=1.0, drawn_points=drawn, doubt=capture.doubt)
     # In one array: its room is found once.
     photos = load_photos(paths, sizes[views], lenses, channels, progress, lambda: meanwhile(loaded))
     train.photos.colors, tested.photos.colors = photos.colors.tensor_split([int(photos.offsets[count])])
-    if given is None:
+    if drawn:
         loaded.point_colors = colors_in_photos(points, train.cameras, train.photos, train.masks)
     notes = (
         *capture.notes,

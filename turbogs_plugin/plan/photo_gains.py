@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from turbogs_plugin.scene import PosedImages
+from turbogs_plugin.scene.geometry import seen
 from turbogs_plugin.scene.sequence import neighbours
 from turbogs_plugin.types import Cameras
 
@@ -97,10 +98,10 @@ def compare_exposures(views: PosedImages, points: Tensor) -> PhotoGains:
         ratios, matches[new] = _compare(patches, *np.divmod(new, count))
         parts.append((new, ratios))
         found[seeking] += matches[pairs] > 0
-    seen, ratios = (np.concatenate(part) for part in zip(*parts, strict=True))
-    kept = matches[seen] > 0
-    pairs = np.stack(np.divmod(seen[kept], count), axis=1)  # [E, 2]
-    gains = fit_gains(pairs, ratios[kept], np.sqrt(matches[seen[kept]]), count)
+    looked_at, ratios = (np.concatenate(part) for part in zip(*parts, strict=True))
+    kept = matches[looked_at] > 0
+    pairs = np.stack(np.divmod(looked_at[kept], count), axis=1)  # [E, 2]
+    gains = fit_gains(pairs, ratios[kept], np.sqrt(matches[looked_at[kept]]), count)
     compared = np.bincount(pairs.reshape(-1), minlength=count) > 0  # [V]
     names = [views.names[view] for view in np.flatnonzero(compared)]
     among, near = gains[compared], neighbours(views.names, names, names)
@@ -181,13 +182,12 @@ def _patches(views: PosedImages, cameras: Cameras, points: Tensor) -> _Patches:
 def _sight(views: PosedImages, cameras: Cameras, points: Tensor) -> tuple[NDArray[np.bool_], Integers, Integers]:
     """Which of some points each photo shows, and their pixels, x and y: [V, Q] each."""
     chosen = points[:: max(1, -(-len(points) // POINTS_AT_MOST))].cpu().double().numpy()  # [Q, 3]
-    matrices, (widths, heights) = (cameras.Ks @ cameras.viewmats[:, :3]).numpy(), cameras.sizes.T[:, :, None]
-    x, y, depths = (matrices[:, :, :3] @ chosen.T + matrices[:, :, 3:]).swapaxes(0, 1)  # [V, Q] each
-    x, y = x / np.maximum(depths, 1e-9), y / np.maximum(depths, 1e-9)
-    inside = (depths > 1e-9) & (x >= 0) & (y >= 0) & (x < widths) & (y < heights)
-    x, y = (np.where(inside, each, 0.0).astype(np.int64) for each in (x, y))
-    if views.masks is not None:
-        inside &= np.stack([views.masks.image(view).numpy()[y[view], x[view]] for view in range(len(views))])
+    inside = np.zeros((len(views), len(chosen)), dtype=bool)
+    x, y = np.zeros((2, *inside.shape), dtype=np.int64)
+    for view, camera in enumerate(zip(cameras.viewmats.numpy(), cameras.Ks.numpy(), cameras.sizes, strict=True)):
+        rows, pixels, _ = seen(chosen, *camera)
+        x[view, rows], y[view, rows] = columns, lines = pixels.astype(np.int64).T
+        inside[view, rows] = True if views.masks is None else views.masks.image(view)[lines, columns].numpy()
     every = -(-int(inside.sum()) // min(PATCHES_AT_MOST, PATCHES_OF_A_PHOTO * len(views))) or 1
     return inside[:, ::every], x[:, ::every], y[:, ::every]
 
