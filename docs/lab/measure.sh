@@ -34,15 +34,17 @@ walls=0
 
 declare -A caps=([fox]=67 [caliterra]=157 [snowmiku]=57 [bonsai]=161 [train]=203) # thousands, FastGS's numbers
 for capture in "$@"; do
-    ablate record "${SEEDS:-0 1 2}" "$capture" --only no-exposures ssim "cap-${caps[$(basename "$capture")]}k"
+    cap=cap-${caps[$(basename "$capture")]}k
+    ablate record "${SEEDS:-0 1 2}" "$capture" --only no-exposures ssim "$cap" "ssim-$cap"
 done
 structure=(density.absgrad_threshold=4.5e-4 pixel_sampler.unit=tile loss.type=sparse_ssim loss.ssim_weight=0.4)
 for capture in "$@"; do
     wall turbogs "$capture" "${REPEATS:-3}"
     wall no-exposures "$capture" 1 train.exposure=false
     wall ssim "$capture" 1 "${structure[@]}" train.dropout=auto # configs/turbogs-ssim.yaml
-    cap=${caps[$(basename "$capture")]}
-    wall "cap-${cap}k" "$capture" 1 train.exposure=false "density.max_gaussians=${cap}000"
+    cap=${caps[$(basename "$capture")]} capped=(train.exposure=false "density.max_gaussians=${cap}000")
+    wall "cap-${cap}k" "$capture" 1 "${capped[@]}"
+    wall "ssim-cap-${cap}k" "$capture" 1 "${structure[@]}" train.dropout=auto "${capped[@]}"
 done
 wait
 for study in ${STUDIES-paper cameras paper_parts}; do ablate "$study" "0 1 2 3 4" "${@:1:3}"; done
