@@ -56,6 +56,8 @@ BOTH_SIDES = [
     ("backdrop", {"direction_concentration": 0.95}, (), True, "0.950 >= 0.95"),
     ("backdrop", {"direction_concentration": 0.9499}, (), False, "< 0.95"),
     ("backdrop", {"direction_concentration": 0.95}, ("density.max_gaussians=3000",), False, "leave no room"),
+    ("backdrop", {"far_points": 6.0}, (), True, "6.0 extents away >= 6"),
+    ("backdrop", {"far_points": 5.9}, (), False, "5.9 extents away < 6"),
     ("background", {"transparent": False}, (), "black", "opaque"),
     ("background", {"transparent": True}, (), "random", "transparent"),
     ("exposure", gains(0.1, 0.025), (), True, "before and after <= 0.25 of that"),

@@ -25,6 +25,9 @@ from turbogs_plugin.scene.host_arrays import MEMORY_SHARE as HOST_SHARE
 ONE_SIDED = 0.95
 """Direction concentration above which a capture is seen from one side. Nadir grids of aircraft have .99; walks around
 something have .68 (snowmiku) and .83 (fox)."""
+FAR_POINTS = 6.0
+"""Extents beyond which one point in a hundred lies where a capture sees far beyond its subject, mostly a sky: Train has
+13, four other captures 1.5 to 3.4."""
 EXPOSURE_STOPS = 0.05
 """Standard deviation of the photos' exposures, in stops, from which on each photo gets one. Five captures have .16
 to .62."""
@@ -89,14 +92,17 @@ def wanted_background(facts: SceneFacts, config: Config) -> Verdict:
 
 
 def wanted_backdrop(facts: SceneFacts, config: Config) -> Verdict:
-    """A far sphere behind the scene, where all cameras look the same way and much of it is seen by few."""
+    """A far sphere behind the scene, where all cameras look the same way and much of it is seen by few, or where points
+    lie so far away that there is a sky."""
     if config.train.starts_from_model:
         return False, "train.init names a model, which is taken as it is"
     cap, one_sided = cap_of(config), facts.direction_concentration >= ONE_SIDED
     if 0 < cap <= BACKDROP_COUNT:
         return False, f"its {BACKDROP_COUNT} Gaussians leave no room within density.max_gaussians {cap}"
-    return one_sided, (
-        f"view directions concentrated to {facts.direction_concentration:.3f} {_sign(one_sided)} {ONE_SIDED}"
+    far_away = facts.far_points >= FAR_POINTS
+    return one_sided or far_away, (
+        f"view directions concentrated to {facts.direction_concentration:.3f} {_sign(one_sided)} {ONE_SIDED}, "
+        f"one point in 100 lies {facts.far_points:.1f} extents away {_sign(far_away)} {FAR_POINTS:g}"
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 
 from turbogs_plugin.device import free_bytes
@@ -29,6 +30,7 @@ class SceneFacts:
         processes: number of those that will train one model together.
         gains: how far training photos differ in brightness and white balance; None where no setting asks for it.
         reprojection_error: a median in pixels, see `Scene`; None: not known.
+        far_points: the distance from the cameras' mean, in extents, that one point in a hundred exceeds; 0: no points.
     """
 
     train_views: int
@@ -42,6 +44,7 @@ class SceneFacts:
     processes: int = 1
     gains: PhotoGains | None = field(default=None, compare=False)
     reprojection_error: float | None = None
+    far_points: float = 0.0
 
 
 @torch.no_grad()
@@ -63,6 +66,7 @@ def gather_facts(
     pixels, test_pixels = (int(part.cameras.sizes.prod(axis=1).sum()) for part in (scene.train, scene.test))
     host_free = free_host_bytes()
     free = free_bytes(device) if device.type == "cuda" else host_free
+    far = (scene.points - views.cameras.centers.mean(dim=0)).norm(dim=1) / scene.extent
     return SceneFacts(
         train_views=len(views),
         direction_concentration=float(views.cameras.directions.double().mean(dim=0).norm()),
@@ -75,4 +79,5 @@ def gather_facts(
         processes=processes,
         gains=compare_exposures(views, scene.points) if with_exposures else None,
         reprojection_error=scene.reprojection_error,
+        far_points=float(np.quantile(far.numpy(), 0.99)) if len(far) else 0.0,
     )
