@@ -120,14 +120,9 @@ def _of_inria(entry: dict[str, Any], owner: str) -> dict[str, Any]:
 
 
 def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: np.ndarray, frames: int) -> Cameras:
-    """`frames` cameras at even steps of a smooth way through others: centres on a cubic Hermite spline whose tangents
-    are central differences, rotations by slerp, intrinsics linearly.
-
-    Args:
-        viewmats: [C, 4, 4] float64, world to camera.
-        Ks: [C, 3, 3] float64, or [3, 3] of all.
-        size: (width, height) of the film.
-    """
+    """`frames` cameras at even steps of a smooth way through others, of world to camera [C, 4, 4] and intrinsics
+    [C, 3, 3], or [3, 3] of all (float64), for a film of `size` (width, height): centres on a cubic Hermite spline whose
+    tangents are central differences, rotations by slerp, intrinsics linearly."""
     from scipy.interpolate import CubicHermiteSpline
     from scipy.spatial.transform import Rotation, Slerp
 

@@ -40,14 +40,10 @@ def write_refined(scene: Path, out: Path) -> str:
     """Write a COLMAP capture with the refined cameras and points of another: ``sparse/0``, and links to its photos, to
     reduced copies (``images_2``, ...) and masks. Points, colours, features and tracks stay, under their identifiers.
 
-    Returns:
-        Lines for the user: what is unusual about the capture, if anything is; how many cameras were refined, with the
-        median errors in pixels before and after; where it was written.
-
-    Raises:
-        InputError: the capture has no reconstruction or lacks photos; photos show none of its points, or show them
-            elsewhere; its cameras have distortion; `out` exists, or cannot be written.
-    """
+    Lines for the user say what is unusual about the capture, how many cameras were refined, with the median errors in
+    pixels before and after, and where it was written. Raises `InputError` where the capture has no reconstruction or
+    lacks photos, photos show none of its points or show them elsewhere, cameras have distortion, or `out` exists or
+    cannot be written."""
     load_pycolmap()  # where it is absent, that is said first
     if out.exists():
         raise InputError(f"--out '{out}' exists: choose a new folder")
