@@ -59,12 +59,9 @@ class Similarity:
         if not np.array_equal(self.rotation, np.eye(3)):
             w, x, y, z = quaternions(self.rotation[None])[0]
             product = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]).to(gaussians.means)
-            gaussians = replace(
-                gaussians,
-                means=gaussians.means @ torch.from_numpy(self.rotation).to(gaussians.means).T,
-                quats=gaussians.quats @ product.T,
-                shN=_turned_harmonics(gaussians.shN, self.rotation),
-            )
+            means = gaussians.means @ torch.from_numpy(self.rotation).to(gaussians.means).T
+            shN = _turned_harmonics(gaussians.shN, self.rotation)
+            gaussians = replace(gaussians, means=means, quats=gaussians.quats @ product.T, shN=shN)
         means = self.scale * gaussians.means + torch.from_numpy(self.translation).to(gaussians.means)
         return replace(gaussians, means=means, scales=gaussians.scales + math.log(self.scale))
 

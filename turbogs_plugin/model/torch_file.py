@@ -44,10 +44,7 @@ def read_plain(path: Path, name: str, remedy: str = "") -> Any:
         _require_bounded(path)
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=too_large(os.path.getsize(path)))
         for tensor in _tensors(state):
-            if (
-                tensor.device.type != "cpu"
-                or tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes()
-            ):
+            if tensor.device.type != "cpu" or tensor.nbytes > tensor.untyped_storage().nbytes():
                 raise ValueError("it has a tensor that is not stored whole")
         return state
     except OSError as error:
