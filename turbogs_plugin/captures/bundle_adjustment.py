@@ -70,13 +70,8 @@ class Pinholes(NamedTuple):
         return cls(viewmats[:, :3, :3], viewmats[:, :3, 3], Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2], 0.5 * sizes[:, 0])
 
     def moved(self, by: np.ndarray, depths: np.ndarray) -> Pinholes:
-        """The cameras after a step.
-
-        Args:
-            by: [V, PARAMETERS]: rotation vector (3), in radians; translation (3), in `depths`; focal lengths (2),
-                relative; principal point (2), in half widths.
-            depths: [V], of what is before each camera.
-        """
+        """The cameras after a step `by` [V, PARAMETERS]: rotation vector (3), in radians; translation (3), in `depths`
+        [V] of what is before each camera; focal lengths (2), relative; principal point (2), in half widths."""
         turns = _rotations(by[:, :3])
         translations = np.einsum("vij,vj->vi", turns, self.translations) + by[:, 3:6] * depths[:, None]
         focal, centers = self.focal * (1.0 + by[:, 6:8]), self.centers + by[:, 8:] * self.half_widths[:, None]

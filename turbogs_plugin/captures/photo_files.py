@@ -143,15 +143,11 @@ def find_named(
     - Where no name is found so, names stand for files in the scene and in folders of it, `FOLDER_DEPTH` deep.
 
     Of several files for a name, one of its suffix counts before others, then one whose path ends as the name does. A
-    name with several files left, and names with one file in common, stand for none.
+    name with several files left, and names with one file in common, stand for none. Of the `folders` in the scene that
+    names are relative to, '' is the scene itself; `others` are names of files that are no photos.
 
-    Args:
-        folders: in the scene, that names are relative to; '' for the scene itself.
-        others: names of files that are no photos.
-
-    Raises:
-        InputError: a name that cannot be printed, a photo that is named twice, or fewer than `FEWEST_PHOTOS` photos.
-    """
+    Raises `InputError` for a name that cannot be printed, a photo that is named twice, or fewer than `FEWEST_PHOTOS`
+    photos."""
 
     def named_in(places: Sequence[str]) -> list[str | None]:
         files = ((file_named(scene, name, source, place) for place in places) for name in names)
