@@ -42,8 +42,7 @@ FEWEST_OBSERVATIONS = 30  # a photo with fewer keeps its camera: three a paramet
 FINEST = 0.02
 """Pixels: errors below are not taken for noise of the features, however exact a reconstruction is."""
 FARTHEST_MATCH = 0.02
-"""Share of a photo's width: photos are others than the reconstructed ones where half of the points are farther from
-where photos show them."""
+"""Share of a photo's width: where half of the points are farther from where photos show them, photos are others."""
 PARAMETERS = 10
 DERIVATIVES = (
     ((0, 4, -1), (1, 0, 1), (1, 3, 1), (2, 2, -1), (3, 6, 1), (5, 7, -1), (6, 1, 1)),
@@ -137,8 +136,7 @@ def farthest_match(cameras: Pinholes) -> float:
 
 
 def of_these_photos(cameras: Pinholes, points: np.ndarray, observations: Observations) -> bool:
-    """True where observations belong to the photos of these cameras, not to others or to another size: half of the
-    points are within `farthest_match`."""
+    """Whether observations are of these cameras' photos, in their size: half of the points within `farthest_match`."""
     return _median(reprojection_errors(cameras, points, observations)) <= farthest_match(cameras)
 
 
@@ -164,8 +162,7 @@ class _Adjustment:
         self.scale = max(_median(self.first_errors), FINEST)  # pixels; errors far above it count little
 
     def _seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The observations: x / z, y / z and z in the camera [3, O]; residuals [2, O]; their lengths [O], infinite
-        behind the camera."""
+        """x / z, y / z and z in the camera [3, O]; residuals [2, O]; their lengths [O], infinite behind the camera."""
         cameras = self.cameras
         sights = np.take(self.places, self.point_ids, axis=1)
         residuals = np.empty((2, sights.shape[1]))
@@ -179,8 +176,8 @@ class _Adjustment:
         return sights, residuals, np.where((sights[2] > 0) & np.isfinite(errors), errors, math.inf)
 
     def _counted(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The observations: x / z, y / z and 1 / z in the camera [3, O]; residuals [2, O]; Cauchy's weights [O], in
-        units of the noise. All are 0 where the error is infinite."""
+        """x / z, y / z and 1 / z in the camera [3, O]; residuals [2, O]; Cauchy's weights [O], in units of the noise.
+        All are 0 where the error is infinite."""
         sights, residuals, errors = self._seen()
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
             np.divide(1.0, sights[2], out=sights[2])
@@ -296,8 +293,7 @@ class RefinedCameras(NamedTuple):
 
 def find_cameras(scene: Scene, training: bool = True) -> RefinedCameras | None:
     """Cameras that agree better with where photos show the scene's points; None where the capture does not say that, or
-    says it of other photos. Without `training`, training cameras and points stay, and only the test photos get cameras
-    beside theirs."""
+    says it of other photos. Without `training`, training cameras and points stay."""
     places = scene.points.double().numpy()
     given, tested = _pinholes(scene.train.cameras), _pinholes(scene.test.cameras)
     shown, seen = scene.train.observations, scene.test.observations

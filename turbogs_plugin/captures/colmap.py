@@ -137,8 +137,7 @@ def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict
 
 
 def read_reconstruction(folder: Path, suffix: str) -> pycolmap.Reconstruction:
-    """The reconstruction, which `read_colmap` has read, as pycolmap reads it, with whole names. Raises `InputError`
-    where it cannot."""
+    """What `read_colmap` has read, as pycolmap reads it, with whole names. Raises `InputError` where it cannot."""
     reconstruction = load_pycolmap().Reconstruction()
     try:
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(folder)

@@ -164,8 +164,7 @@ def write_demo_capture(path: str | Path, seed: int = 0, views: int = 32, width: 
 
 
 def _photographed(folder: Path, seed: int, views: int, width: int, height: int) -> pycolmap.Reconstruction:
-    """Write the photos, whose cameras stand on a ring about the table that swings in height; and what COLMAP would have
-    made of them."""
+    """Write the photos, from a ring about the table that swings in height; and what COLMAP would have made of them."""
     random, side, focal = np.random.default_rng(seed), RAYS_PER_SIDE, FOCAL * width
     angles, poses = 2 * np.pi * np.arange(views) / views, np.empty((views, 3, 4))
     for view, angle in enumerate(angles):

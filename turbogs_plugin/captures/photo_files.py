@@ -95,8 +95,7 @@ def broken_link(path: Path) -> str:
 
 
 def files_below(folder: Path, depth: int = FOLDER_DEPTH, masks: bool = False) -> Iterator[PurePosixPath]:
-    """Paths of files relative to a folder that they lie in, in no folder that is hidden or, but with `masks`, one of
-    `NO_PHOTOS`."""
+    """Files below a folder, as paths in it, in none that is hidden or, but with `masks`, one of `NO_PHOTOS`."""
     for place, inner, files in os.walk(folder, followlinks=True):
         at = PurePosixPath(Path(place).relative_to(folder).as_posix())
         allowed = [name for name in inner if name.isprintable() and (masks or not NO_PHOTOS.fullmatch(name))]
@@ -146,8 +145,7 @@ def find_named(
     name with several files left, and names with one file in common, stand for none. Of the `folders` in the scene that
     names are relative to, '' is the scene itself; `others` are names of files that are no photos.
 
-    Raises `InputError` for a name that cannot be printed, a photo that is named twice, or fewer than `FEWEST_PHOTOS`
-    photos."""
+    Raises `InputError` for a name that cannot be printed, a photo named twice, or fewer than `FEWEST_PHOTOS` photos."""
 
     def named_in(places: Sequence[str]) -> list[str | None]:
         files = ((file_named(scene, name, source, place) for place in places) for name in names)

@@ -153,8 +153,7 @@ def resized(cameras: Cameras, width: int, height: int) -> Cameras:
 
 
 def _common_lens(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """Intrinsics [3, 3] with the picture's middle as principal point, and an even (width, height): the median camera's,
-    reduced to `WIDEST_FILM`."""
+    """The median camera's intrinsics [3, 3], centred, and its even (width, height), reduced to `WIDEST_FILM`."""
     order = np.argsort(cameras.sizes.prod(axis=1), kind="stable")
     middle = int(order[len(order) // 2])
     by = min(1.0, WIDEST_FILM / cameras.sizes[middle].max())

@@ -92,8 +92,7 @@ def write_refined(scene: Path, out: Path) -> str:
 
 
 def _reconstruction(model: Path, suffix: str, capture: Capture, refined: Refinement) -> pycolmap.Reconstruction:
-    """The reconstruction in `model`, from which a capture was read, with refined cameras, and points in the order of
-    their identifiers."""
+    """The reconstruction in `model`, of which a capture was read, with refined cameras and points (by identifiers)."""
     pycolmap = load_pycolmap()
     old, new = read_reconstruction(model, suffix), pycolmap.Reconstruction()
     images = {image.name: image for image in old.images.values() if image.has_pose}

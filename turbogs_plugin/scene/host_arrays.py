@@ -84,8 +84,7 @@ def free_host_bytes() -> int:
 
 
 def _group_rooms() -> list[int]:
-    """Bytes left in each control group (version 2) with a limit that this process is in; what files keep cached counts
-    as left."""
+    """Bytes left in each control group (version 2) of this process that has a limit; files' caches count as left."""
     rooms, root = [], Path("/sys/fs/cgroup")
     own = next((line[3:] for line in _lines(Path("/proc/self/cgroup")) if line.startswith("0::")), "")
     inner = root / own.lstrip("/")
