@@ -313,14 +313,9 @@ def with_cameras(scene: Scene, found: RefinedCameras | None) -> Scene:
     """The scene with these cameras; as it is where none were found."""
     if found is None:
         return scene
-    return replace(
-        scene,
-        train=replace(scene.train, cameras=found.train),
-        test=replace(scene.test, refined=found.test),
-        points=found.points,
-        reprojection_error=found.reprojection_error,
-        notes=(*scene.notes, *found.notes),
-    )
+    train, test = replace(scene.train, cameras=found.train), replace(scene.test, refined=found.test)
+    error, notes = found.reprojection_error, (*scene.notes, *found.notes)
+    return replace(scene, train=train, test=test, points=found.points, reprojection_error=error, notes=notes)
 
 
 def refine_cameras(scene: Scene, training: bool = True) -> Scene:

@@ -67,9 +67,7 @@ def _beside(photos: Sequence[Path]) -> str:
 def mask_finder(folders: Sequence[Path], photos: Path) -> Callable[[str], Path | None]:
     """A function from a photo's name in the folder `photos` to its mask in the first of `folders` that has one, or
     beside the photo by RealityScan's convention; None where there is none."""
-    exact = [
-        {str(place): folder / place for place in photo_files.files_below(folder, masks=True)} for folder in folders
-    ]
+    exact = [{str(at): folder / at for at in photo_files.files_below(folder, masks=True)} for folder in folders]
     inside = [{photo_files.plain(name): file for name, file in files.items()} | files for files in exact]
 
     def find(name: str) -> Path | None:

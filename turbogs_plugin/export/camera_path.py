@@ -163,7 +163,5 @@ def _common_lens(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cameras(viewmats: np.ndarray, Ks: np.ndarray, size: np.ndarray) -> Cameras:
-    lenses = torch.from_numpy(np.broadcast_to(Ks, (len(viewmats), 3, 3)).copy()).float()
-    return Cameras(
-        torch.from_numpy(viewmats).float(), lenses, np.tile(np.rint(size).astype(np.int64), (len(lenses), 1))
-    )
+    lenses, sizes = np.broadcast_to(Ks, (len(viewmats), 3, 3)).copy(), np.tile(np.rint(size), (len(viewmats), 1))
+    return Cameras(torch.from_numpy(viewmats).float(), torch.from_numpy(lenses).float(), sizes.astype(np.int64))

@@ -73,9 +73,8 @@ def export_run(
             frame = Frame(frame.center - origin, frame.scale)
             notes.append(f"about the local origin {' '.join(f'{value:.12g}' for value in origin)}")
         if file_format.startswith("spz"):
-            notes.append(
-                "version 2" if file_format == "spz2" else f"version {VERSION}; older viewers need --format spz2"
-            )
+            newest = f"version {VERSION}; older viewers need --format spz2"
+            notes.append("version 2" if file_format == "spz2" else newest)
         write, read = EXPORTS[file_format]
         write(kept, file, frame, model.iteration or 0, model.antialiased)
         written = kept

@@ -110,9 +110,8 @@ def save_usda(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, ant
 def _tuples(values: Tensor) -> str:
     """Numbers [N], or tuples of numbers [N, D], with nine digits, which give back every float32."""
     item = "%.9g" if values.dim() == 1 else f"({', '.join(['%.9g'] * values.shape[1])})"
-    return ", ".join(
-        ", ".join([item] * len(part)) % tuple(part.flatten().tolist()) for part in values.split(ROWS_AT_ONCE)
-    )
+    parts = values.split(ROWS_AT_ONCE)
+    return ", ".join(", ".join([item] * len(part)) % tuple(part.flatten().tolist()) for part in parts)
 
 
 def save_splat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, antialiased: bool = False) -> None:
