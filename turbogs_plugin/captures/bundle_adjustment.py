@@ -33,8 +33,7 @@ from turbogs_plugin.types.cameras import Observations
 
 ROUNDS, CAMERA_STEPS, RESECTION_STEPS = 6, 2, 10
 PRIOR = 0.006
-"""Standard deviation of every parameter of a camera before any is learnt, in the units of `Pinholes.moved`: four to six
-pixels at the edge of a photo of 1200."""
+"""Standard deviation of a parameter of `Pinholes.moved` before any is learnt: 4 to 6 pixels at the edge of 1200."""
 SMALLEST_VARIANCE = 1e-14  # smallest variance in the prior, so that it can be inverted
 POINT_DAMPING = 1e-4
 """Damping of a point's normal equations, relative to their trace: a point stays in a direction that no photo tells."""
@@ -112,8 +111,7 @@ def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observa
 def refine_alone(
     cameras: Pinholes, points: np.ndarray, observations: Observations, spread: np.ndarray | None = None
 ) -> Pinholes:
-    """Cameras that agree better with points, which stay. `spread`: of a `Refinement` of other photos of the capture;
-    None: `PRIOR` of each parameter."""
+    """Cameras that agree better with points, which stay. `spread`: of the capture's `Refinement`; None: by `PRIOR`."""
     adjustment = _Adjustment(cameras, points, observations, spread)
     for _ in range(RESECTION_STEPS):
         adjustment.move_cameras()
@@ -141,8 +139,7 @@ def of_these_photos(cameras: Pinholes, points: np.ndarray, observations: Observa
 
 
 class _Adjustment:
-    """Cameras and points on their way. What observations have is coordinate by coordinate, [2, O] or [3, O]: a row is
-    read and written in one go."""
+    """Cameras and points on their way. Arrays of observations are [2, O] or [3, O]: rows are read and written whole."""
 
     def __init__(
         self, cameras: Pinholes, points: np.ndarray, observations: Observations, spread: np.ndarray | None = None

@@ -49,8 +49,7 @@ MOST_THREADS = 16
 
 
 def reduced_sizes(sizes: np.ndarray, factor: float) -> np.ndarray:
-    """[V, 2] int64: sizes divided by `factor`, to the nearest pixel. Raises `InputError` where the factor leaves a side
-    of less than `SMALLEST_SIDE`."""
+    """[V, 2] int64: sizes over `factor`, to the nearest pixel. Raises `InputError` for sides below `SMALLEST_SIDE`."""
     reduced = np.floor(sizes / factor + 0.5).astype(np.int64)
     if factor > 1 and reduced.min() < SMALLEST_SIDE:
         width, height = sizes[sizes.min(axis=1).argmin()].tolist()

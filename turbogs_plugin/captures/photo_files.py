@@ -49,8 +49,7 @@ IMAGES, REDUCED = "images", tuple(f"images_{factor}" for factor in (2, 4, 8, 16)
 
 
 def find_photos(folder: Path) -> tuple[Path, list[Path]]:
-    """The photos of a folder in the order of their names; where it has a folder ``images``, of that one. And the folder
-    that their names are relative to, first."""
+    """The folder that has a folder's photos, its ``images`` or itself, and the photos in the order of their names."""
     for place in (folder / IMAGES, folder):
         files = [place / path for path in files_below(place, PHOTO_DEPTH) if path.suffix.lower() in PHOTO_SUFFIXES]
         if photos := set(files).difference(maps_beside(files)):

@@ -41,8 +41,7 @@ EXPORTS: dict[str, tuple[Write, Read | None]] = {
     "glb": (save_glb, None),
     "usda": (save_usda, None),
 }
-"""Name, as on the command line, whose letters are the file's suffix -> how a file is written and read again, None where
-every number is as it was."""
+"""Name on the command line, its letters the file's suffix -> how it is written and read; None: no number changes."""
 MOST_ON_PAGE = 800_000
 """Largest model of a page: 36 bytes a Gaussian make about 30 MB, which mail and chat programs take."""
 MOST_VIEWS = 8
@@ -57,8 +56,7 @@ def export_run(
 
     `file_format` is one of `EXPORTS`, or `PAGE`. Without `out`, the new file lies in the run's folder, where
     ``model.ply`` is the training's own. Of more than `max_gaussians`, those stay that add most to the training views.
-    Raises `InputError` where an option does not fit, or there is no such model, or no usable capture where it is
-    needed."""
+    Raises `InputError` where an option does not fit, or there is no such model, or no usable capture though needed."""
     file, is_page = _required_file(path, file_format, out, max_gaussians, given), file_format == PAGE
     most = min(max_gaussians or MOST_ON_PAGE, MOST_ON_PAGE) if is_page else max_gaussians
     model, scene, absent = load_with_capture(path, given, resolve_device("auto"), needed=most is not None)

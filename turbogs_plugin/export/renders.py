@@ -1,5 +1,4 @@
-"""Renders of a saved model: from its capture's cameras as PNGs, and films along a path of cameras, encoded by the
-ffmpeg of imageio-ffmpeg (`turbogs render`)."""
+"""Renders of a saved model: PNGs from its capture's cameras, and films by imageio-ffmpeg (`turbogs render`)."""
 
 from __future__ import annotations
 
@@ -109,7 +108,7 @@ def film_run(
 def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path, fps: float) -> None:
     """Render a model, as it looks, and encode a film in a new file, whose suffix says which container. The cameras of
     the frames are all of one size; an odd side loses a pixel, which the encoder needs. Raises `InputError` where the
-    encoder refuses; then nothing is left behind."""
+    encoder refuses. Nothing is left behind where this fails."""
     import imageio_ffmpeg
 
     width, height = (cameras.sizes[0] // 2 * 2).tolist()
