@@ -155,9 +155,7 @@ def machine(monkeypatch):
 
     def make(seed: int) -> Machine:
         machine = Machine(seed)
-        monkeypatch.setattr(offload, "_CopyStream", lambda device: Stream(machine))
-        monkeypatch.setattr(offload, "_mark", lambda device: machine.compute.mark())
-        monkeypatch.setattr(offload, "_wait", lambda device, events: machine.compute.wait(events))
+        monkeypatch.setattr(offload, "_Stream", lambda device, own: Stream(machine) if own else machine.compute)
         monkeypatch.setattr(offload, "synchronize", lambda device: machine.run())
         return machine
 

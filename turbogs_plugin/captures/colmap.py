@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from turbogs_plugin.captures import colmap_files
-from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, named, require_printable, text_of
+from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, named, text_of
 from turbogs_plugin.captures.colmap_files import CLOUD, FILES, ColmapModel, ModelImage, read_model
 from turbogs_plugin.captures.photo_files import IMAGES, find_named
 from turbogs_plugin.captures.starting_points import clouds_beside
@@ -137,8 +137,7 @@ def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict
 
 
 def read_reconstruction(folder: Path, suffix: str) -> pycolmap.Reconstruction:
-    """The reconstruction as pycolmap reads it, with whole names. Raises `InputError` where it cannot, or where a name
-    cannot be printed."""
+    """What `read_colmap` has read, as pycolmap reads it, with whole names. Raises `InputError` where it cannot."""
     reconstruction = load_pycolmap().Reconstruction()
     try:
         (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(folder)
@@ -146,7 +145,6 @@ def read_reconstruction(folder: Path, suffix: str) -> pycolmap.Reconstruction:
         raise InputError(f"{folder}: pycolmap cannot read this reconstruction; copy or reconstruct it again") from error
     for image in read_model(folder, suffix).images:  # pycolmap cuts a name in text at its first space
         if image.number in reconstruction.images:
-            require_printable(image.name, folder)
             reconstruction.images[image.number].name = image.name.replace("\\", "/")
     return reconstruction
 

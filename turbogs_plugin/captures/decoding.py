@@ -49,8 +49,7 @@ MOST_THREADS = 16
 
 
 def reduced_sizes(sizes: np.ndarray, factor: float) -> np.ndarray:
-    """[V, 2] int64: sizes divided by `factor`, to the nearest pixel. Raises `InputError` where the factor leaves a side
-    of less than `SMALLEST_SIDE`."""
+    """[V, 2] int64: sizes over `factor`, to the nearest pixel. Raises `InputError` for sides below `SMALLEST_SIDE`."""
     reduced = np.floor(sizes / factor + 0.5).astype(np.int64)
     if factor > 1 and reduced.min() < SMALLEST_SIDE:
         width, height = sizes[sizes.min(axis=1).argmin()].tolist()
@@ -102,20 +101,14 @@ def load_photos(
     progress: Callable[[int, int], object] | None = None,
     meanwhile: Callable[[], object] = lambda: None,
 ) -> Photos:
-    """Decode V photos in parallel, undistorted, then reduced to their target sizes by area averaging. They are taken as
-    stored: an orientation in EXIF is ignored, as COLMAP does.
+    """Decode V photos in parallel, undistorted where they have one of the `lenses`, then reduced to their `targets`
+    [V, 2] int64 (width, height) by area averaging. They are taken as stored: an orientation in EXIF is ignored, as
+    COLMAP does.
 
-    Args:
-        targets: [V, 2] int64 (width, height) to give them.
-        lenses: one a photo, None for a pinhole camera.
-        channels: 3, where photos that are transparent lose their alpha and keep their colours as stored; or 4, where
-            3 are kept after all if every pixel is opaque.
-        progress: called with the number of photos decoded so far, and of all.
-        meanwhile: called while threads decode.
-
-    Raises:
-        InputError: a photo that cannot be decoded, the first one in order; more photos than fit in memory or on disk.
-    """
+    With 3 `channels`, photos that are transparent lose their alpha and keep their colours as stored; of 4, 3 are kept
+    after all if every pixel is opaque. `progress` is called with the number of photos decoded so far, and of all;
+    `meanwhile` while threads decode. Raises `InputError` for the first photo in order that cannot be decoded, and for
+    more photos than fit in memory or on disk."""
     # Pillow's mode with an a has colours that are multiplied by alpha.
     offsets, mode = pixel_offsets(targets), "RGBa" if channels == 4 else "RGB"
 

@@ -164,20 +164,18 @@ def write_demo_capture(path: str | Path, seed: int = 0, views: int = 32, width: 
 
 
 def _photographed(folder: Path, seed: int, views: int, width: int, height: int) -> pycolmap.Reconstruction:
-    """Write the photos, whose cameras stand on a ring about the table that swings in height; and what COLMAP would have
-    made of them."""
+    """Write the photos, from a ring about the table that swings in height; and what COLMAP would have made of them."""
     random, side, focal = np.random.default_rng(seed), RAYS_PER_SIDE, FOCAL * width
-    angles, poses = 2 * np.pi * np.arange(views) / views, np.empty((views, 3, 4))
-    for view, angle in enumerate(angles):
-        ring = ORBIT_RADIUS * np.array([np.cos(angle), np.sin(angle)])
-        at = np.array([*ring, ORBIT_HEIGHT + ORBIT_SWING * np.sin(3 * angle)])
-        poses[view] = look_at(at, target=np.array([0.0, 0.0, LOOK_AT]), up=np.array([0.0, 0.0, 1.0]))[:3]
-    solids = demo_solids(random)
+    poses, solids = np.empty((views, 3, 4)), demo_solids(random)
     x, y = np.meshgrid((np.arange(width * side) + 0.5) / side, (np.arange(height * side) + 0.5) / side)
     rays = np.stack([(x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)], axis=-1)
     depths = np.empty((views, height, width), dtype=np.float32)  # of pixels' centres; infinite where there is nothing
     chosen_points, chosen_colors = [], []
     for view, pose in enumerate(poses):
+        angle = 2 * np.pi * view / views
+        ring = ORBIT_RADIUS * np.array([np.cos(angle), np.sin(angle)])
+        at = np.array([*ring, ORBIT_HEIGHT + ORBIT_SWING * np.sin(3 * angle)])
+        pose[:] = look_at(at, target=np.array([0.0, 0.0, LOOK_AT]), up=np.array([0.0, 0.0, 1.0]))[:3]
         origin = (-pose[:, :3].T @ pose[:, 3]).astype(np.float32)
         directions = (rays.reshape(-1, 3) @ pose[:, :3]).astype(np.float32)
         lengths = np.linalg.norm(directions, axis=1, keepdims=True)

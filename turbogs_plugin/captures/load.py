@@ -204,11 +204,8 @@ def _masked_note(names: tuple[str, ...], masks: list[PixelMasks | None], sizes: 
 def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path], np.ndarray, np.ndarray, str]:
     """The files of V photos, reduced by `factor`: copies in ``images_<factor>`` where all are there in the right size,
     else the capture's photos. Photos of ``images_4`` that are smaller than their cameras by that are reduced already.
-
-    Returns:
-        Paths; [V, 2] int64 (width, height) of the files; [V, 2] int64 to give them, undistorted and reduced; a note on
-        photos of another size than their cameras.
-    """
+    And [V, 2] int64 (width, height) of the files; [V, 2] int64 to give them, undistorted and reduced; a note on photos
+    of another size than their cameras."""
     cameras, bent = capture.photo_sizes, np.array([lens is not None for lens in capture.lenses])
     copies = capture.photo_folder.with_name(f"{capture.photo_folder.name}_{factor}")
     paths = [copies / name for name in capture.names]

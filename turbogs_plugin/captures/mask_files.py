@@ -25,8 +25,7 @@ CONVENTIONS = "NAME.png, NAME.EXTENSION.png or NAME.jpg"
 FORMS = ["{stem}.png", "{name}.png", "{name}.mask.png", "{stem}_mask.png", "{name}", "{stem}.jpg", "{stem}.jpeg"]
 """Names of masks in their folder, in any letters, the first that is there before others."""
 MASK_PIXELS = 16
-"""Pixels of a mask for each of its photo, at most: where the photo is reduced, the mask need not be. An even mask is a
-file of few bytes."""
+"""Most pixels of a mask for each of its photo, which may be reduced; an even mask is a file of few bytes."""
 HALF = 128  # value from which a pixel of a JPEG counts, whose compression leaves no exact zeros
 
 
@@ -68,9 +67,7 @@ def _beside(photos: Sequence[Path]) -> str:
 def mask_finder(folders: Sequence[Path], photos: Path) -> Callable[[str], Path | None]:
     """A function from a photo's name in the folder `photos` to its mask in the first of `folders` that has one, or
     beside the photo by RealityScan's convention; None where there is none."""
-    exact = [
-        {str(place): folder / place for place in photo_files.files_below(folder, masks=True)} for folder in folders
-    ]
+    exact = [{str(at): folder / at for at in photo_files.files_below(folder, masks=True)} for folder in folders]
     inside = [{photo_files.plain(name): file for name, file in files.items()} | files for files in exact]
 
     def find(name: str) -> Path | None:

@@ -36,12 +36,11 @@ PANORAMA_REMEDY = "cut it into perspective photos and reconstruct these (pycolma
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A camera with distortion, and the pinhole camera that takes its place: (width, height) of its images, and its
-    intrinsics [3, 3] float64."""
+    """A camera with distortion, and the pinhole camera that takes its place."""
 
     camera: pycolmap.Camera
-    size: tuple[int, int]
-    K: np.ndarray
+    size: tuple[int, int]  # (width, height) of the pinhole's images
+    K: np.ndarray  # [3, 3] float64, intrinsics of the pinhole
 
     @property
     def photo_size(self) -> tuple[int, int]:
@@ -49,8 +48,7 @@ class Lens:
         return self.camera.width, self.camera.height
 
     def size_of(self, photo_size: tuple[int, int]) -> tuple[int, int]:
-        """(width, height) of the pinhole's image for photos of a size: smaller for ones below `photo_size`, but no
-        larger for others."""
+        """(width, height) of the pinhole's image for photos of a size: smaller for a smaller photo, never larger."""
         ratios = np.divide(photo_size, self.photo_size).clip(max=1.0)
         width, height = np.floor(np.multiply(self.size, ratios) + 0.5).astype(np.int64).clip(min=1).tolist()
         return width, height

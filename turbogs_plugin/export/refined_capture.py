@@ -40,43 +40,33 @@ def write_refined(scene: Path, out: Path) -> str:
     """Write a COLMAP capture with the refined cameras and points of another: ``sparse/0``, and links to its photos, to
     reduced copies (``images_2``, ...) and masks. Points, colours, features and tracks stay, under their identifiers.
 
-    Returns:
-        Lines for the user: what is unusual about the capture, if anything is; how many cameras were refined, with the
-        median errors in pixels before and after; where it was written.
-
-    Raises:
-        InputError: the capture has no reconstruction or lacks photos; photos show none of its points, or show them
-            elsewhere; its cameras have distortion; `out` exists, or cannot be written.
-    """
+    Lines for the user say what is unusual about the capture, how many cameras were refined, with the median errors in
+    pixels before and after, and where it was written. Raises `InputError` where the capture has no reconstruction or
+    lacks photos, photos show none of its points or show them elsewhere, cameras have distortion, or `out` exists or
+    cannot be written."""
     load_pycolmap()  # where it is absent, that is said first
     if out.exists():
         raise InputError(f"--out '{out}' exists: choose a new folder")
     require_writable(out, f"--out '{out}'")
     found = find_model(scene) if scene.is_dir() else None
     if found is None:
-        raise InputError(
-            f"{scene} has no COLMAP reconstruction (cameras, images and points3D in sparse/0): make one of its photos "
-            f"by  turbogs reconstruct {shlex.quote(str(scene))} --out SCENE"
-        )
+        remedy = f"make one of its photos by  turbogs reconstruct {shlex.quote(str(scene))} --out SCENE"
+        raise InputError(f"{scene} has no COLMAP reconstruction (cameras, images and points3D in sparse/0): {remedy}")
     capture = read_colmap(scene, *found)
     if bent := [lens.camera.model.name for lens in capture.lenses if lens is not None]:
-        raise InputError(
-            f"{found[0]}: {len(bent)} of {len(capture.names)} cameras have distortion ({bent[0]}), and refined cameras "
-            "are pinholes: undistort the capture first by 'colmap image_undistorter', then use what that writes"
-        )
+        some = f"{len(bent)} of {len(capture.names)} cameras have distortion ({bent[0]})"
+        remedy = "undistort the capture first by 'colmap image_undistorter', then use what that writes"
+        raise InputError(f"{found[0]}: {some}, and refined cameras are pinholes: {remedy}")
     if not (observations := capture.observations):
-        raise InputError(
-            f"{found[0]} has no points that its photos show, by which cameras are refined: give a reconstruction as "
-            "COLMAP wrote it, with points and tracks"
-        )
+        remedy = "give a reconstruction as COLMAP wrote it, with points and tracks"
+        raise InputError(f"{found[0]} has no points that its photos show, by which cameras are refined: {remedy}")
     if capture.photo_folder.resolve() in out.resolve().parents:
         raise InputError(f"--out '{out}' would lie among the photos of '{capture.photo_folder}': choose another folder")
     given = Pinholes.of(capture.viewmats, capture.Ks, capture.sizes)
     if not of_these_photos(given, capture.points, observations):
-        raise InputError(
-            f"{found[0]}: half of its points are more than {farthest_match(given):.1f} pixels ({FARTHEST_MATCH:.0%} of "
-            "a photo's width) from where its photos show them: reconstruct the photos again"
-        )
+        far = f"more than {farthest_match(given):.1f} pixels ({FARTHEST_MATCH:.0%} of a photo's width)"
+        trouble = f"half of its points are {far} from where its photos show them"
+        raise InputError(f"{found[0]}: {trouble}: reconstruct the photos again")
     refined = refine_together(given, capture.points, observations)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".") as temporary:
@@ -88,16 +78,14 @@ def write_refined(scene: Path, out: Path) -> str:
                 (folder / name).symlink_to(source.resolve(), target_is_directory=True)
             write_whole(_reconstruction(*found, capture, refined), folder / "sparse/0", out)
         except OSError as error:
-            raise InputError(
-                f"--out '{out}' cannot be written: make room there, or choose a disk that takes links"
-            ) from error
+            remedy = "make room there, or choose a disk that takes links"
+            raise InputError(f"--out '{out}' cannot be written: {remedy}") from error
         folder.rename(out)
     return "\n".join([*capture.notes[1:], refined.text("cameras"), f"scene  {out}"])
 
 
 def _reconstruction(model: Path, suffix: str, capture: Capture, refined: Refinement) -> pycolmap.Reconstruction:
-    """The reconstruction in `model`, from which a capture was read, with refined cameras, and points in the order of
-    their identifiers."""
+    """The reconstruction in `model`, of which a capture was read, with refined cameras and points (by identifiers)."""
     pycolmap = load_pycolmap()
     old, new = read_reconstruction(model, suffix), pycolmap.Reconstruction()
     images = {image.name: image for image in old.images.values() if image.has_pose}

@@ -34,8 +34,7 @@ SPLAT = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4)
 
 
 def save_glb(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, antialiased: bool = False) -> None:
-    """Write a binary glTF: points, whose attributes a reader of the extension draws as Gaussians. `InputError` for more
-    than 4 GB."""
+    """Write a binary glTF: points that readers of the extension draw as Gaussians. `InputError` for more than 4 GB."""
     model = upright(in_capture(gaussians, frame, path))
     color = (SH_C0 * model.sh0[:, 0] + 0.5).clamp(0.0, 1.0)
     linear = torch.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)  # as glTF has COLOR_0
@@ -111,9 +110,8 @@ def save_usda(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, ant
 def _tuples(values: Tensor) -> str:
     """Numbers [N], or tuples of numbers [N, D], with nine digits, which give back every float32."""
     item = "%.9g" if values.dim() == 1 else f"({', '.join(['%.9g'] * values.shape[1])})"
-    return ", ".join(
-        ", ".join([item] * len(part)) % tuple(part.flatten().tolist()) for part in values.split(ROWS_AT_ONCE)
-    )
+    parts = values.split(ROWS_AT_ONCE)
+    return ", ".join(", ".join([item] * len(part)) % tuple(part.flatten().tolist()) for part in parts)
 
 
 def save_splat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, antialiased: bool = False) -> None:

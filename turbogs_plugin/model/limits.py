@@ -14,8 +14,7 @@ POINTS, SHARE = 10, 0.9
 """Nearest points of a camera, as single ones may be wrong, and the largest share of its distance from them that its
 radius may be: objects photographed from near by stay."""
 RARE = 0.002
-"""Share of the points that have a camera within the largest radius: where a camera stands before a wall without points,
-the wall stays."""
+"""Share of the points that have a camera within the largest radius: a wall without points, before a camera, stays."""
 POINTS_LOOKED_AT, DISTANCES_AT_ONCE = 100_000, 1 << 22
 """Points that are used at most, evenly in their order; points times cameras at a time, which bounds memory."""
 DISTANT = 2.0
@@ -29,16 +28,14 @@ RESTRAIN_EVERY = 10
 class Clearance:
     """A sphere around each training camera, at `centers` [V, 3] and of `radii` [V], that is kept free of Gaussians.
 
-    Faint Gaussians before a camera cost it little, but veil a test view from there: a haze that no training view
-    corrects."""
+    Faint Gaussians before a camera cost it little, but veil a test view from there; no training view corrects that."""
 
     centers: Tensor
     radii: Tensor
 
     @classmethod
     def of(cls, points: Tensor, centers: Tensor) -> Clearance | None:
-        """The spheres of a capture with points [M, 3], on the device of `centers` [V, 3]; None where it has fewer than
-        `POINTS` points."""
+        """The spheres by points [M, 3], on the device of `centers` [V, 3]; None for fewer than `POINTS` points."""
         if len(points) < POINTS:
             return None
         from scipy.spatial import cKDTree

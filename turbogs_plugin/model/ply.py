@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -44,12 +43,8 @@ def save_ply(gaussians: Gaussians, path: Path, frame: Frame = OWN, step: int = 0
     mode = f"comment SplatRenderMode: {'mip' if antialiased else 'default'}"
     header = ["ply", "format binary_little_endian 1.0", mode, f"element vertex {len(table)}"]
     header += [f"property {kind} {name}" for parameter, kind in kinds.items() for name in groups[parameter]]
-
-    def write(file: BinaryIO) -> None:
-        file.write("\n".join([*header, "end_header\n"]).encode())
-        file.write(table.data)
-
-    write_atomically(path, write)
+    head = "\n".join([*header, "end_header\n"]).encode()
+    write_atomically(path, lambda file: file.writelines([head, table.data]))
 
 
 def read_ply(path: Path) -> tuple[Gaussians, bool]:

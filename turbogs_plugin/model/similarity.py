@@ -54,17 +54,13 @@ class Similarity:
         return moved
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
-        """The model in the new coordinates, in its own dtype. Without a rotation, quaternions and harmonics keep
-        their bits."""
+        """The model in the new coordinates, in its dtype; unless turned, quaternions and harmonics keep their bits."""
         if not np.array_equal(self.rotation, np.eye(3)):
             w, x, y, z = quaternions(self.rotation[None])[0]
             product = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]).to(gaussians.means)
-            gaussians = replace(
-                gaussians,
-                means=gaussians.means @ torch.from_numpy(self.rotation).to(gaussians.means).T,
-                quats=gaussians.quats @ product.T,
-                shN=_turned_harmonics(gaussians.shN, self.rotation),
-            )
+            means = gaussians.means @ torch.from_numpy(self.rotation).to(gaussians.means).T
+            shN = _turned_harmonics(gaussians.shN, self.rotation)
+            gaussians = replace(gaussians, means=means, quats=gaussians.quats @ product.T, shN=shN)
         means = self.scale * gaussians.means + torch.from_numpy(self.translation).to(gaussians.means)
         return replace(gaussians, means=means, scales=gaussians.scales + math.log(self.scale))
 
@@ -115,8 +111,7 @@ def rounding(frame: Frame) -> float:
 
 
 def _finite(gaussians: Gaussians, file: str | Path) -> Gaussians:
-    """The Gaussians of which every number is finite, with a warning that counts the others. Raises `InputError` where
-    there is none."""
+    """The Gaussians that are finite; a warning counts the others. Raises `InputError` where there is none."""
     finite = gaussians.finite_rows()
     if not finite.any():
         raise InputError(f"{file}: none of its {len(finite)} Gaussians is finite: there is no model to use")

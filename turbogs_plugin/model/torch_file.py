@@ -44,10 +44,7 @@ def read_plain(path: Path, name: str, remedy: str = "") -> Any:
         _require_bounded(path)
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=too_large(os.path.getsize(path)))
         for tensor in _tensors(state):
-            if (
-                tensor.device.type != "cpu"
-                or tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes()
-            ):
+            if tensor.device.type != "cpu" or tensor.nbytes > tensor.untyped_storage().nbytes():
                 raise ValueError("it has a tensor that is not stored whole")
         return state
     except OSError as error:
@@ -145,15 +142,12 @@ def save_gsplat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, a
 
 def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:
     """The model in a state that gsplat's trainer saved, in the file's own coordinates; float64, on the CPU, perhaps
-    with rows that are not finite. Raises `InputError`, about the file `path`, where parameters are missing or of other
-    shapes."""
+    with rows that are not finite. Raises `InputError`, about the file `path`, for parameters that lack or misfit."""
     splats = state["splats"] if isinstance(state["splats"], Mapping) else {}
     if missing := [name for name in PARAMETER_NAMES if not isinstance(splats.get(name), Tensor)]:
         present = ", ".join(sorted(map(str, splats))[:8]) or "nothing"
-        raise InputError(
-            f"{path}: its splats lack {', '.join(missing)} (there is {present}): give a 3DGS model, trained without "
-            "gsplat's appearance network (app_opt)"
-        )
+        remedy = "give a 3DGS model, trained without gsplat's appearance network (app_opt)"
+        raise InputError(f"{path}: its splats lack {', '.join(missing)} (there is {present}): {remedy}")
     count = len(splats["means"]) if splats["means"].dim() else 0
     bands = splats["shN"].shape[1] if splats["shN"].dim() == 3 else -1
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 1, 3), (count, bands, 3))
@@ -163,8 +157,6 @@ def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:
             kind = f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
             raise InputError(f"{path}: {name} is {kind} where gsplat has float32 {shape}: export the model again")
     if not count or bands not in BANDS:
-        raise InputError(
-            f"{path} holds {count} Gaussians whose shN has {bands} bands: export a model with harmonics of degree "
-            "0 .. 3, which has 0, 3, 8 or 15"
-        )
+        remedy = "export a model with harmonics of degree 0 .. 3, which has 0, 3, 8 or 15"
+        raise InputError(f"{path} holds {count} Gaussians whose shN has {bands} bands: {remedy}")
     return Gaussians(**{name: splats[name].detach().double() for name in PARAMETER_NAMES})

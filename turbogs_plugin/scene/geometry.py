@@ -38,8 +38,7 @@ def viewmat_of_pose(axes: np.ndarray, center: np.ndarray) -> np.ndarray:
 def seen(
     points: np.ndarray, viewmat: np.ndarray, K: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The points [M, 3] that a camera sees in its image of `size` (width, height): their rows [S], pixels [S, 2] and
-    depths [S]."""
+    """Rows [S], pixels [S, 2] and depths [S] of the points [M, 3] in a camera's image of `size` (width, height)."""
     places = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     rows = np.flatnonzero(places[:, 2] > 0)
     pixels = places[rows] @ K.T

@@ -35,14 +35,10 @@ def host_array(shape: Sequence[int], dtype: torch.dtype, what: str) -> Tensor:
         return torch.empty(*shape, dtype=dtype)
     folder = _folder()
     try:
-        file, name = tempfile.mkstemp(prefix="turbogs-", dir=folder)
-        try:
+        with tempfile.NamedTemporaryFile(prefix="turbogs-", dir=folder) as file:
             # All of it now: a disk that is full later would end the process without a word.
-            os.posix_fallocate(file, 0, size)
-            return torch.from_file(name, shared=True, size=elements, dtype=dtype).view(*shape)
-        finally:
-            os.close(file)
-            os.unlink(name)
+            os.posix_fallocate(file.fileno(), 0, size)
+            return torch.from_file(file.name, shared=True, size=elements, dtype=dtype).view(*shape)
     except (OSError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:160]
         raise InputError(
@@ -88,8 +84,7 @@ def free_host_bytes() -> int:
 
 
 def _group_rooms() -> list[int]:
-    """Bytes left in each control group (version 2) with a limit that this process is in; what files keep cached counts
-    as left."""
+    """Bytes left in each control group (version 2) of this process that has a limit; files' caches count as left."""
     rooms, root = [], Path("/sys/fs/cgroup")
     own = next((line[3:] for line in _lines(Path("/proc/self/cgroup")) if line.startswith("0::")), "")
     inner = root / own.lstrip("/")

@@ -63,7 +63,7 @@ class ViewWindow:
         self._slot_pixels = int(sizes.prod(axis=1).max())
         self._used: set[int] = set()
         self._arrays: tuple[Tensor, ...] = ()
-        self._inward, self._outward = _CopyStream(self.device), _CopyStream(self.device)
+        self._inward, self._outward, self._computing = (_Stream(self.device, own) for own in (True, True, False))
         self._allocate(SETS)
         if self.device.type == "cuda":
             _page_lock(self)
@@ -74,7 +74,7 @@ class ViewWindow:
 
         What is enqueued next on the current stream comes after the copies that `fetch` has begun.
         """
-        _wait(self.device, self._arriving)
+        self._computing.wait(self._arriving)
         self._arriving.clear()
         return self._arrays
 
@@ -140,14 +140,14 @@ class ViewWindow:
         self.offsets[:] = ABSENT
         self._slot_of: dict[int, int] = {}  # of the views in the window, the latest in use last
         self._free = list(reversed(range(slots)))
-        self._released = [_mark(self.device)] * slots  # of each slot: the end of the work that used it
+        self._released = [self._computing.mark()] * slots  # of each slot: the end of the work that used it
         self._used = set()
         self._changed: set[int] = set()
         self._arriving: list[torch.cuda.Event] = []
 
     def _release(self) -> None:
         """Note that work enqueued so far is the last that uses the views in use."""
-        now = _mark(self.device)
+        now = self._computing.mark()
         for view in self._used:
             self._released[self._slot_of[view]] = now
         self._used = set()
@@ -182,26 +182,16 @@ class ViewWindow:
         return [store[start:end] for store in self.stores]
 
 
-class _Windowed:
-    """Arrays in host memory that are used through a window on a device."""
-
-    _window: ViewWindow
-
-    @property
-    def offsets(self) -> np.ndarray:
-        """See `ViewWindow`."""
-        return self._window.offsets
-
-    def fetch(self, view_ids: Sequence[int]) -> None:
-        self._window.fetch(view_ids)
-
-
-class OffloadedPhotos(_Windowed, Photos):
+class OffloadedPhotos(Photos):
     """Photos in host memory, with a window on a device; `colors` and `offsets` are the window's."""
 
     def __init__(self, photos: Photos, device: torch.device | str) -> None:
         self.sizes = photos.sizes
         self._window = ViewWindow((photos.stored.cpu(),), photos.sizes, device, written=False)
+        self.offsets = self._window.offsets
+
+    def fetch(self, view_ids: Sequence[int]) -> None:
+        self._window.fetch(view_ids)
 
     @property
     def stored(self) -> Tensor:
@@ -215,7 +205,7 @@ class OffloadedPhotos(_Windowed, Photos):
         return self if torch.device(device) == self._window.device else OffloadedPhotos(self, device)
 
 
-class OffloadedErrorMaps(_Windowed, ErrorMaps):  # type: ignore[override]  # `offsets` is the window's
+class OffloadedErrorMaps(ErrorMaps):
     """Error maps in host memory, with a window on a device; `errors`, `stamps` and `offsets` are the window's."""
 
     @property
@@ -227,6 +217,10 @@ class OffloadedErrorMaps(_Windowed, ErrorMaps):  # type: ignore[override]  # `of
         errors, stamps = (host_array((pixels,), dtype, "error maps") for dtype in (torch.float16, torch.int16))
         stores = (errors.zero_(), stamps.fill_(-1))
         self._window = ViewWindow(stores, self.sizes, self.device, written=True)
+        self.offsets = self._window.offsets
+
+    def fetch(self, view_ids: Sequence[int]) -> None:
+        self._window.fetch(view_ids)
 
     def _copies(self) -> tuple[Tensor, Tensor]:
         """Maps in a file are given as they lie there, to be saved before training goes on: a copy may find no room."""
@@ -247,39 +241,29 @@ def place_views(views: PosedImages, device: torch.device, place: str) -> PosedIm
     return replace(views.with_cameras_on(device), photos=OffloadedPhotos(views.photos, device))
 
 
-class _CopyStream:
-    """Copies in one direction, beside the computation; on a CPU, at once. `latest` is the end of those begun so far."""
+class _Stream:
+    """Copies in one direction, on a stream of their `own` beside the computation; or the computation, on the current
+    stream. On a CPU all is done at once, and there are no events. `latest` is the end of what was begun so far."""
 
-    def __init__(self, device: torch.device) -> None:
-        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+    def __init__(self, device: torch.device, own: bool) -> None:
+        self._device = device
+        self._own = torch.cuda.Stream(device) if own and device.type == "cuda" else None
         self.latest: list[torch.cuda.Event] = []
 
     def wait(self, events: Sequence[torch.cuda.Event]) -> None:
-        """Copies from now on come after these events."""
-        if self._stream is not None:
-            for event in dict.fromkeys(events):
-                self._stream.wait_event(event)
+        """What is enqueued from now on comes after these events."""
+        for event in dict.fromkeys(events):
+            (self._own or torch.cuda.current_stream(self._device)).wait_event(event)
 
     def copy(self, target: Tensor, source: Tensor) -> None:
-        with torch.cuda.stream(self._stream):  # which does nothing for None
-            target.copy_(source, non_blocking=self._stream is not None)
+        with torch.cuda.stream(self._own):  # which does nothing for None
+            target.copy_(source, non_blocking=self._own is not None)
 
     def mark(self) -> list[torch.cuda.Event]:
-        """The end of the copies begun so far."""
-        if self._stream is not None:
-            self.latest = [self._stream.record_event()]
+        """The end of what is enqueued so far."""
+        if self._device.type == "cuda":
+            self.latest = [(self._own or torch.cuda.current_stream(self._device)).record_event()]
         return self.latest
-
-
-def _mark(device: torch.device) -> list[torch.cuda.Event]:
-    """The end of the work enqueued so far on the current stream; empty on a CPU."""
-    return [torch.cuda.current_stream(device).record_event()] if device.type == "cuda" else []
-
-
-def _wait(device: torch.device, events: Sequence[torch.cuda.Event]) -> None:
-    """Work enqueued from now on on the current stream comes after these."""
-    for event in dict.fromkeys(events):
-        torch.cuda.current_stream(device).wait_event(event)
 
 
 def _page_lock(window: ViewWindow) -> None:

@@ -70,13 +70,12 @@ class Photos:
 
 @dataclass(frozen=True)
 class PhotoSamples:
-    """Ground truth of an iteration, not gathered yet: the kernel of the loss reads the photos itself. `depths`: for a
-    loss with a depth term."""
+    """Ground truth of an iteration, not gathered yet: the kernel of the loss reads the photos itself."""
 
     photos: Photos
     samples: PixelSamples
     background: Color = BLACK
-    depths: DepthPair | None = None
+    depths: DepthPair | None = None  # for a loss with a depth term
 
     @property
     def starts(self) -> np.ndarray:

@@ -31,8 +31,7 @@ def neighbours(names: Iterable[str], known: Sequence[str], photos: Sequence[str]
     """The nearest known photos before and after each of `photos`; none is its own neighbour. `names` are of all photos,
     with their folders, in which numbers count as numbers.
 
-    The photos of one folder are taken for one sequence: cameras, and programs that cut videos, number what they
-    write."""
+    The photos of one folder are taken for one sequence: cameras, and programs that cut videos, number theirs."""
     places = {name: place for place, name in enumerate(sorted(set(names), key=_key))}
     there = sorted((places[name], row, _folder(name)) for row, name in enumerate(known))
     rows, weights = np.zeros((len(photos), 2), dtype=np.int64), np.zeros((len(photos), 2))
