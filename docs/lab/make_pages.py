@@ -34,6 +34,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "steps h200": partial(timings.steps, "step-h200.json"),
     "steps h100": partial(timings.steps, "step-h100.json"),
     "raster": timings.raster,
+    "gsplat main": timings.gsplat_main,
     "ranks": timings.ranks,
     "rank runs": timings.rank_runs,
     "dropin": timings.dropin,

@@ -63,6 +63,18 @@ def raster() -> str:
     return on(record, table(("Gaussians", "K", "gsplat 1.5.3, dense", "ours, r = 1", "ours, r = 0.1"), lines))
 
 
+def gsplat_main() -> str:
+    """Milliseconds of our sparse pass and of gsplat main's, MiB, and the largest relative L2 error of a gradient."""
+    record, lines = read_json("gsplat_main.json"), []
+    for row in record["rows"]:
+        for who in ("ours", "main"):
+            found = row[who]
+            times = (f"{found[name]:.2f}" for name in ("lists", "forward", "backward", "pass"))
+            lines.append((f"{row['rate']:.0%}", who, *times, f"{found['mib']:.0f}", f"{found['error']:.0e}"))
+    head = ("pixels", "", "layout and lists", "forward", "backward", "pass", "MiB", "error of a gradient")
+    return f"{record['device']}, commit {record['commit'][:7]}, {record['day']}.\n\n{table(head, lines)}"
+
+
 def ranks() -> str:
     """Milliseconds of an iteration on several GPUs, and times one GPU: in pixels a second where the batch is larger."""
     record = read_json("ranks.json")

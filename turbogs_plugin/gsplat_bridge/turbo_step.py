@@ -71,7 +71,7 @@ class TurboStep:
     memory is shared, so what the host writes into them is trained on. Where a step changes the number of Gaussians,
     ``splats`` gets new Parameters, as by gsplat's operations, and the `optimizers` are told, which are not stepped.
 
-    The first step appends a backdrop of `BACKDROP_COUNT` Gaussians where all cameras look one way. The last of
+    The first step appends a backdrop of `BACKDROP_COUNT` Gaussians where the plan wants one. The last of
     `max_steps` steps ends with the mean of the last tenth. All randomness follows from ``torch.initial_seed()``.
 
     Args:
