@@ -19,10 +19,12 @@ from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 def rasterize(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:
     """`Engine.render` by the engine of the Gaussians' device; `options` are the fields of `RenderOptions`. Raises
-    `InputError`: cameras of other views than the samples', or Gaussians that a gradient is wanted of."""
+    `InputError`: cameras of other views than the samples', or Gaussians in half precision or with gradients wanted."""
     rows, views = cameras.by_row()[2], samples.view_ids
     if len(rows) != len(views) or (isinstance(rows, tuple) and sorted(rows) == sorted(views) and rows != views):
         raise InputError(f"cameras are of views {list(rows)}, samples of {list(views)}: give cameras.select(view_ids)")
+    if gaussians.means.dtype not in (torch.float32, torch.float64):
+        raise InputError(f"means are of {gaussians.means.dtype}: give float32, by gaussians.map(torch.Tensor.float)")
     if torch.is_grad_enabled() and any(value.requires_grad for _, value in gaussians.items()):
         raise InputError("rasterize makes no graph: render under torch.no_grad(), or by rasterize_differentiable")
     return engine_of(gaussians.device).render(gaussians, cameras, samples, RenderOptions(**options))
