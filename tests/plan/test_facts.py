@@ -37,11 +37,12 @@ def test_concentration_of_view_directions(scene, tilt):
     assert gather_facts(of_views(scene, viewmats), CPU).direction_concentration == pytest.approx(cosine, abs=1e-6)
 
 
-@pytest.mark.parametrize(("far", "distance"), [(0, 1.0), (10, 1.0), (30, 7.0)])
-def test_one_point_in_a_hundred_lies_further_away(scene, far, distance):
-    distances = torch.tensor([7.0] * far + [1.0] * (1000 - far)) * scene.extent
+@pytest.mark.parametrize(("near", "far", "expected"), [(0.5, 0, 0.5), (0.5, 10, 0.5), (0.5, 30, 7), (3.5, 30, 2)])
+def test_one_point_in_a_hundred_lies_further_away(scene, near, far, expected):
+    distances = torch.tensor([7.0] * far + [near] * (1000 - far)) * scene.extent
     points = scene.train.cameras.centers.mean(dim=0) + torch.eye(3)[2] * distances[:, None]
-    assert gather_facts(replace(scene, points=points), CPU).far_points == pytest.approx(distance, rel=0.1)
+    assert gather_facts(replace(scene, points=points), CPU).far_points == pytest.approx(expected, rel=0.2)
+    assert gather_facts(replace(scene, points=points, drawn_points=True), CPU).far_points == 0.0
 
 
 @pytest.mark.parametrize("points", [[], [[0.0, 0.0, 100.0]]], ids=["none", "unseen"])

@@ -26,8 +26,8 @@ ONE_SIDED = 0.95
 """Direction concentration above which a capture is seen from one side. Nadir grids of aircraft have .99; walks around
 something have .68 (snowmiku) and .83 (fox)."""
 FAR_POINTS = 6.0
-"""Extents beyond which one point in a hundred lies where a capture sees far beyond its subject, mostly a sky: Train has
-13, four other captures 1.5 to 3.4."""
+"""Scene sizes (`SceneFacts`) beyond which one point in a hundred lies where a capture sees far beyond its subject and
+mostly a sky: Train has 13, four other captures 1.3 to 1.8."""
 EXPOSURE_STOPS = 0.05
 """Standard deviation of the photos' exposures, in stops, from which on each photo gets one. Five captures have .16
 to .62."""
@@ -102,7 +102,7 @@ def wanted_backdrop(facts: SceneFacts, config: Config) -> Verdict:
     far_away = facts.far_points >= FAR_POINTS
     return one_sided or far_away, (
         f"view directions concentrated to {facts.direction_concentration:.3f} {_sign(one_sided)} {ONE_SIDED}, "
-        f"one point in 100 lies {facts.far_points:.1f} extents away {_sign(far_away)} {FAR_POINTS:g}"
+        f"one point in 100 lies {facts.far_points:.1f} scene sizes away {_sign(far_away)} {FAR_POINTS:g}"
     )
 
 

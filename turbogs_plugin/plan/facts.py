@@ -30,7 +30,8 @@ class SceneFacts:
         processes: number of those that will train one model together.
         gains: how far training photos differ in brightness and white balance; None where no setting asks for it.
         reprojection_error: a median in pixels, see `Scene`; None: not known.
-        far_points: the distance from the cameras' mean, in extents, that one point in a hundred exceeds; 0: no points.
+        far_points: the distance from the cameras' mean that one point in a hundred exceeds, in sizes of the scene: the
+            extent, or the points' median distance where that is more; 0: no points, or drawn ones.
     """
 
     train_views: int
@@ -66,7 +67,9 @@ def gather_facts(
     pixels, test_pixels = (int(part.cameras.sizes.prod(axis=1).sum()) for part in (scene.train, scene.test))
     host_free = free_host_bytes()
     free = free_bytes(device) if device.type == "cuda" else host_free
-    far = (scene.points - views.cameras.centers.mean(dim=0)).norm(dim=1) / scene.extent
+    distances = (scene.points - views.cameras.centers.mean(dim=0)).norm(dim=1).numpy()
+    known = len(distances) > 0 and not scene.drawn_points
+    middle, far = np.quantile(distances, (0.5, 0.99)) if known else (0.0, 0.0)
     return SceneFacts(
         train_views=len(views),
         direction_concentration=float(views.cameras.directions.double().mean(dim=0).norm()),
@@ -79,5 +82,5 @@ def gather_facts(
         processes=processes,
         gains=compare_exposures(views, scene.points) if with_exposures else None,
         reprojection_error=scene.reprojection_error,
-        far_points=float(np.quantile(far.numpy(), 0.99)) if len(far) else 0.0,
+        far_points=float(far / max(scene.extent, middle)),
     )
