@@ -46,7 +46,8 @@ def strategy_class(kind: str, name: Any) -> type:
     elif name not in known:  # entry points stand in the files of every installed package
         known = {point.name: point.value for point in entry_points(group=f"turbogs.{kind}")} | known
     if name not in known:
-        raise InputError(f"unknown {kind}.type '{name}': {nearest(name, known)}; another's needs its package installed")
+        others = "another's is module:Class, or the name that its installed package gives it"
+        raise InputError(f"unknown {kind}.type '{name}': {nearest(name, known)}; {others}")
     place = f"{kind}.type '{name}'" + (f" ({known[name]})" if known[name] != name else "")
     try:
         found = EntryPoint(name, known[name], f"turbogs.{kind}").load()
