@@ -33,7 +33,8 @@ from turbogs_plugin.types.cameras import Observations
 
 ROUNDS, CAMERA_STEPS, RESECTION_STEPS = 6, 2, 10
 PRIOR = 0.006
-"""Standard deviation of a parameter of `Pinholes.moved` before any is learnt: 4 to 6 pixels at the edge of 1200."""
+"""Standard deviation of every parameter of a camera before any is learnt, in the units of `Pinholes.moved`: four to six
+pixels at the edge of a photo of 1200."""
 SMALLEST_VARIANCE = 1e-14  # smallest variance in the prior, so that it can be inverted
 POINT_DAMPING = 1e-4
 """Damping of a point's normal equations, relative to their trace: a point stays in a direction that no photo tells."""
@@ -41,7 +42,8 @@ FEWEST_OBSERVATIONS = 30  # a photo with fewer keeps its camera: three a paramet
 FINEST = 0.02
 """Pixels: errors below are not taken for noise of the features, however exact a reconstruction is."""
 FARTHEST_MATCH = 0.02
-"""Share of a photo's width: where half of the points are farther from where photos show them, photos are others."""
+"""Share of a photo's width: photos are others than the reconstructed ones where half of the points are farther from
+where photos show them."""
 PARAMETERS = 10
 DERIVATIVES = (
     ((0, 4, -1), (1, 0, 1), (1, 3, 1), (2, 2, -1), (3, 6, 1), (5, 7, -1), (6, 1, 1)),
@@ -68,8 +70,13 @@ class Pinholes(NamedTuple):
         return cls(viewmats[:, :3, :3], viewmats[:, :3, 3], Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2], 0.5 * sizes[:, 0])
 
     def moved(self, by: np.ndarray, depths: np.ndarray) -> Pinholes:
-        """The cameras after a step `by` [V, PARAMETERS]: rotation vector (3), in radians; translation (3), in `depths`
-        [V] of what is before each camera; focal lengths (2), relative; principal point (2), in half widths."""
+        """The cameras after a step.
+
+        Args:
+            by: [V, PARAMETERS]: rotation vector (3), in radians; translation (3), in `depths`; focal lengths (2),
+                relative; principal point (2), in half widths.
+            depths: [V], of what is before each camera.
+        """
         turns = _rotations(by[:, :3])
         translations = np.einsum("vij,vj->vi", turns, self.translations) + by[:, 3:6] * depths[:, None]
         focal, centers = self.focal * (1.0 + by[:, 6:8]), self.centers + by[:, 8:] * self.half_widths[:, None]
@@ -111,7 +118,8 @@ def refine_together(cameras: Pinholes, points: np.ndarray, observations: Observa
 def refine_alone(
     cameras: Pinholes, points: np.ndarray, observations: Observations, spread: np.ndarray | None = None
 ) -> Pinholes:
-    """Cameras that agree better with points, which stay. `spread`: of the capture's `Refinement`; None: by `PRIOR`."""
+    """Cameras that agree better with points, which stay. `spread`: of a `Refinement` of other photos of the capture;
+    None: `PRIOR` of each parameter."""
     adjustment = _Adjustment(cameras, points, observations, spread)
     for _ in range(RESECTION_STEPS):
         adjustment.move_cameras()
@@ -134,7 +142,8 @@ def farthest_match(cameras: Pinholes) -> float:
 
 
 def of_these_photos(cameras: Pinholes, points: np.ndarray, observations: Observations) -> bool:
-    """Whether observations are of these cameras' photos, in their size: half of the points within `farthest_match`."""
+    """True where observations belong to the photos of these cameras, not to others or to another size: half of the
+    points are within `farthest_match`."""
     return _median(reprojection_errors(cameras, points, observations)) <= farthest_match(cameras)
 
 
@@ -290,7 +299,8 @@ class RefinedCameras(NamedTuple):
 
 def find_cameras(scene: Scene, training: bool = True) -> RefinedCameras | None:
     """Cameras that agree better with where photos show the scene's points; None where the capture does not say that, or
-    says it of other photos. Without `training`, training cameras and points stay."""
+    says it of other photos. Without `training`, training cameras and points stay, and only the test photos get cameras
+    beside theirs."""
     places = scene.points.double().numpy()
     given, tested = _pinholes(scene.train.cameras), _pinholes(scene.test.cameras)
     shown, seen = scene.train.observations, scene.test.observations

@@ -181,7 +181,8 @@ class _Text:
         raise self._damaged("ends where a name should follow")
 
     def features(self) -> np.ndarray:
-        """[n] of `FEATURE`: the next line, which may lack: the next image's ends in a name or has ten words."""
+        """[n] of `FEATURE`: the next line. It may be empty, or lack: then there is the next image's, which ends in a
+        name or has ten words."""
         words = self.lines[self.number].split() if self.number < len(self.lines) else []
         if len(words) == 10 or (len(words) > 10 and not NUMBER.fullmatch(words[-1])):
             return np.zeros(0, FEATURE)

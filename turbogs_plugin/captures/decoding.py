@@ -101,14 +101,20 @@ def load_photos(
     progress: Callable[[int, int], object] | None = None,
     meanwhile: Callable[[], object] = lambda: None,
 ) -> Photos:
-    """Decode V photos in parallel, undistorted where they have one of the `lenses`, then reduced to their `targets`
-    [V, 2] int64 (width, height) by area averaging. They are taken as stored: an orientation in EXIF is ignored, as
-    COLMAP does.
+    """Decode V photos in parallel, undistorted, then reduced to their target sizes by area averaging. They are taken as
+    stored: an orientation in EXIF is ignored, as COLMAP does.
 
-    With 3 `channels`, photos that are transparent lose their alpha and keep their colours as stored; of 4, 3 are kept
-    after all if every pixel is opaque. `progress` is called with the number of photos decoded so far, and of all;
-    `meanwhile` while threads decode. Raises `InputError` for the first photo in order that cannot be decoded, and for
-    more photos than fit in memory or on disk."""
+    Args:
+        targets: [V, 2] int64 (width, height) to give them.
+        lenses: one a photo, None for a pinhole camera.
+        channels: 3, where photos that are transparent lose their alpha and keep their colours as stored; or 4, where
+            3 are kept after all if every pixel is opaque.
+        progress: called with the number of photos decoded so far, and of all.
+        meanwhile: called while threads decode.
+
+    Raises:
+        InputError: a photo that cannot be decoded, the first one in order; more photos than fit in memory or on disk.
+    """
     # Pillow's mode with an a has colours that are multiplied by alpha.
     offsets, mode = pixel_offsets(targets), "RGBa" if channels == 4 else "RGB"
 

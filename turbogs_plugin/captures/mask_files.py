@@ -25,7 +25,8 @@ CONVENTIONS = "NAME.png, NAME.EXTENSION.png or NAME.jpg"
 FORMS = ["{stem}.png", "{name}.png", "{name}.mask.png", "{stem}_mask.png", "{name}", "{stem}.jpg", "{stem}.jpeg"]
 """Names of masks in their folder, in any letters, the first that is there before others."""
 MASK_PIXELS = 16
-"""Most pixels of a mask for each of its photo, which may be reduced; an even mask is a file of few bytes."""
+"""Pixels of a mask for each of its photo, at most: where the photo is reduced, the mask need not be. An even mask is a
+file of few bytes."""
 HALF = 128  # value from which a pixel of a JPEG counts, whose compression leaves no exact zeros
 
 

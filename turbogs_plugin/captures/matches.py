@@ -58,9 +58,13 @@ def rigid(pair: Pair) -> np.ndarray:
 
 
 def epipolar_distances(relative: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """[N] Sampson distances of matches, `first` and `second` [N, 3] on the image planes z = 1 of two cameras, from the
-    epipolar lines, at a focal length of 1; 0 for cameras in one place, which have no lines. `relative`: [4, 4], from
-    the first camera to the second."""
+    """[N] Sampson distances of matches from the epipolar lines of two cameras, at a focal length of 1; 0 for cameras in
+    one place, which have no lines.
+
+    Args:
+        relative: [4, 4], from the first camera to the second.
+        first, second: [N, 3], the matches on the cameras' image planes, z = 1.
+    """
     rotation, translation = relative[:3, :3], relative[:3, 3]
     length = np.linalg.norm(translation)
     if length == 0:

@@ -49,7 +49,8 @@ IMAGES, REDUCED = "images", tuple(f"images_{factor}" for factor in (2, 4, 8, 16)
 
 
 def find_photos(folder: Path) -> tuple[Path, list[Path]]:
-    """The folder that has a folder's photos, its ``images`` or itself, and the photos in the order of their names."""
+    """The photos of a folder in the order of their names; where it has a folder ``images``, of that one. And the folder
+    that their names are relative to, first."""
     for place in (folder / IMAGES, folder):
         files = [place / path for path in files_below(place, PHOTO_DEPTH) if path.suffix.lower() in PHOTO_SUFFIXES]
         if photos := set(files).difference(maps_beside(files)):
@@ -94,7 +95,8 @@ def broken_link(path: Path) -> str:
 
 
 def files_below(folder: Path, depth: int = FOLDER_DEPTH, masks: bool = False) -> Iterator[PurePosixPath]:
-    """Files below a folder, as paths in it, in none that is hidden or, but with `masks`, one of `NO_PHOTOS`."""
+    """Paths of files relative to a folder that they lie in, in no folder that is hidden or, but with `masks`, one of
+    `NO_PHOTOS`."""
     for place, inner, files in os.walk(folder, followlinks=True):
         at = PurePosixPath(Path(place).relative_to(folder).as_posix())
         allowed = [name for name in inner if name.isprintable() and (masks or not NO_PHOTOS.fullmatch(name))]
@@ -141,10 +143,15 @@ def find_named(
     - Where no name is found so, names stand for files in the scene and in folders of it, `FOLDER_DEPTH` deep.
 
     Of several files for a name, one of its suffix counts before others, then one whose path ends as the name does. A
-    name with several files left, and names with one file in common, stand for none. Of the `folders` in the scene that
-    names are relative to, '' is the scene itself; `others` are names of files that are no photos.
+    name with several files left, and names with one file in common, stand for none.
 
-    Raises `InputError` for a name that cannot be printed, a photo named twice, or fewer than `FEWEST_PHOTOS` photos."""
+    Args:
+        folders: in the scene, that names are relative to; '' for the scene itself.
+        others: names of files that are no photos.
+
+    Raises:
+        InputError: a name that cannot be printed, a photo that is named twice, or fewer than `FEWEST_PHOTOS` photos.
+    """
 
     def named_in(places: Sequence[str]) -> list[str | None]:
         files = ((file_named(scene, name, source, place) for place in places) for name in names)

@@ -120,9 +120,14 @@ def _of_inria(entry: dict[str, Any], owner: str) -> dict[str, Any]:
 
 
 def interpolated(viewmats: np.ndarray, Ks: np.ndarray, size: np.ndarray, frames: int) -> Cameras:
-    """`frames` cameras at even steps of a smooth way through others, of world to camera [C, 4, 4] and intrinsics
-    [C, 3, 3], or [3, 3] of all (float64), for a film of `size` (width, height): centres on a cubic Hermite spline whose
-    tangents are central differences, rotations by slerp, intrinsics linearly."""
+    """`frames` cameras at even steps of a smooth way through others: centres on a cubic Hermite spline whose tangents
+    are central differences, rotations by slerp, intrinsics linearly.
+
+    Args:
+        viewmats: [C, 4, 4] float64, world to camera.
+        Ks: [C, 3, 3] float64, or [3, 3] of all.
+        size: (width, height) of the film.
+    """
     from scipy.interpolate import CubicHermiteSpline
     from scipy.spatial.transform import Rotation, Slerp
 
@@ -153,7 +158,8 @@ def resized(cameras: Cameras, width: int, height: int) -> Cameras:
 
 
 def _common_lens(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """The median camera's intrinsics [3, 3], centred, and its even (width, height), reduced to `WIDEST_FILM`."""
+    """Intrinsics [3, 3] with the picture's middle as principal point, and an even (width, height): the median camera's,
+    reduced to `WIDEST_FILM`."""
     order = np.argsort(cameras.sizes.prod(axis=1), kind="stable")
     middle = int(order[len(order) // 2])
     by = min(1.0, WIDEST_FILM / cameras.sizes[middle].max())

@@ -41,7 +41,8 @@ EXPORTS: dict[str, tuple[Write, Read | None]] = {
     "glb": (save_glb, None),
     "usda": (save_usda, None),
 }
-"""Name on the command line, its letters the file's suffix -> how it is written and read; None: no number changes."""
+"""Name, as on the command line, whose letters are the file's suffix -> how a file is written and read again, None where
+every number is as it was."""
 MOST_ON_PAGE = 800_000
 """Largest model of a page: 36 bytes a Gaussian make about 30 MB, which mail and chat programs take."""
 MOST_VIEWS = 8
@@ -51,12 +52,21 @@ MOST_VIEWS = 8
 def export_run(
     path: Path, file_format: str, out: Path | None, max_gaussians: int | None = None, given: Config | None = None
 ) -> str:
-    """Write the newest model of the run in `path`, or with `given`, its capture and how to render it, that of the file
-    `path`. Three lines for the user: the new file, sizes, and PSNR of the model and of what was written.
+    """Write a run's newest model or a given one, and compare what was written with it.
 
-    `file_format` is one of `EXPORTS`, or `PAGE`. Without `out`, the new file lies in the run's folder, where
-    ``model.ply`` is the training's own. Of more than `max_gaussians`, those stay that add most to the training views.
-    Raises `InputError` where an option does not fit, or there is no such model, or no usable capture though needed."""
+    Args:
+        path: folder of the run, or the file of a model.
+        file_format: one of `EXPORTS`, or `PAGE`.
+        out: new file; None: in the run's folder, where ``model.ply`` is the training's own.
+        max_gaussians: largest number of Gaussians to keep, those that add most to the training views; None: all.
+        given: the capture of a model from a file, and how to render it; None: `path` is a run.
+
+    Returns:
+        Three lines for the user: the file, sizes, and PSNR before and after.
+
+    Raises:
+        InputError: an option does not fit, no such model, or no usable capture where it is needed.
+    """
     file, is_page = _required_file(path, file_format, out, max_gaussians, given), file_format == PAGE
     most = min(max_gaussians or MOST_ON_PAGE, MOST_ON_PAGE) if is_page else max_gaussians
     model, scene, absent = load_with_capture(path, given, resolve_device("auto"), needed=most is not None)

@@ -40,10 +40,14 @@ def write_refined(scene: Path, out: Path) -> str:
     """Write a COLMAP capture with the refined cameras and points of another: ``sparse/0``, and links to its photos, to
     reduced copies (``images_2``, ...) and masks. Points, colours, features and tracks stay, under their identifiers.
 
-    Lines for the user say what is unusual about the capture, how many cameras were refined, with the median errors in
-    pixels before and after, and where it was written. Raises `InputError` where the capture has no reconstruction or
-    lacks photos, photos show none of its points or show them elsewhere, cameras have distortion, or `out` exists or
-    cannot be written."""
+    Returns:
+        Lines for the user: what is unusual about the capture, if anything is; how many cameras were refined, with the
+        median errors in pixels before and after; where it was written.
+
+    Raises:
+        InputError: the capture has no reconstruction or lacks photos; photos show none of its points, or show them
+            elsewhere; its cameras have distortion; `out` exists, or cannot be written.
+    """
     load_pycolmap()  # where it is absent, that is said first
     if out.exists():
         raise InputError(f"--out '{out}' exists: choose a new folder")
@@ -85,7 +89,8 @@ def write_refined(scene: Path, out: Path) -> str:
 
 
 def _reconstruction(model: Path, suffix: str, capture: Capture, refined: Refinement) -> pycolmap.Reconstruction:
-    """The reconstruction in `model`, of which a capture was read, with refined cameras and points (by identifiers)."""
+    """The reconstruction in `model`, from which a capture was read, with refined cameras, and points in the order of
+    their identifiers."""
     pycolmap = load_pycolmap()
     old, new = read_reconstruction(model, suffix), pycolmap.Reconstruction()
     images = {image.name: image for image in old.images.values() if image.has_pose}

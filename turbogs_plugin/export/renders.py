@@ -32,11 +32,20 @@ INSTALL = 'pip install "imageio-ffmpeg>=0.5"'
 def render_run(
     path: Path, split: str, device_name: str, with_depth: bool, given: Config | None = None, out: Path | None = None
 ) -> list[Path]:
-    """Write the views of a split, rendered from the model of `open_saved`, as PNGs into a folder in `out`, else in
-    ``renders`` of the run, and say what was done with the capture's photos: where they were undistorted, the cameras
-    are, too. `with_depth` writes into a second folder each view's expected depth along the camera's axis, in the
-    capture's own units, 0 where nothing was hit: as ``.npy`` ([H, W] float32) and as a coloured PNG (`depth_picture`).
-    The folders are returned. Raises `InputError` as `open_saved`, and where there is no folder to write to."""
+    """Write the views of a split, rendered from the model of `open_saved`, as PNGs, and say what was done with the
+    capture's photos: where they were undistorted, the cameras are, too.
+
+    Args:
+        with_depth: also write each view's expected depth along the camera's axis, in the capture's own units, 0 where
+            nothing was hit: as ``.npy`` ([H, W] float32) and as a coloured PNG (`depth_picture`).
+        out: folder for the folder of the views; None: ``renders`` of the run.
+
+    Returns:
+        The folder of the views, and with depth the folder of the depths.
+
+    Raises:
+        InputError: as of `open_saved`, or there is no folder to write to.
+    """
     if out is not None:
         require_writable(out, f"--out '{out}'")
     elif given is not None:
@@ -106,9 +115,15 @@ def film_run(
 
 
 def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path, fps: float) -> None:
-    """Render a model, as it looks, and encode a film in a new file, whose suffix says which container. The cameras of
-    the frames are all of one size; an odd side loses a pixel, which the encoder needs. Raises `InputError` where the
-    encoder refuses. Nothing is left behind where this fails."""
+    """Render a model, as it looks, and encode a film. Nothing is left behind where this fails.
+
+    Args:
+        cameras: of the frames, all of one size; an odd side loses a pixel, which the encoder needs.
+        video: a new file, whose suffix says which container.
+
+    Raises:
+        InputError: the encoder refused.
+    """
     import imageio_ffmpeg
 
     width, height = (cameras.sizes[0] // 2 * 2).tolist()

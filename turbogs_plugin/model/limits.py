@@ -14,7 +14,7 @@ POINTS, SHARE = 10, 0.9
 """Nearest points of a camera, as single ones may be wrong, and the largest share of its distance from them that its
 radius may be: objects photographed from near by stay."""
 RARE = 0.002
-"""Share of the points that have a camera within the largest radius: a wall without points, before a camera, stays."""
+"""Share of the points that have a camera within the largest radius. A wall without points before a camera stays."""
 POINTS_LOOKED_AT, DISTANCES_AT_ONCE = 100_000, 1 << 22
 """Points that are used at most, evenly in their order; points times cameras at a time, which bounds memory."""
 DISTANT = 2.0

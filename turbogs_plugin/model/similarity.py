@@ -54,7 +54,7 @@ class Similarity:
         return moved
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
-        """The model in the new coordinates, in its dtype; unless turned, quaternions and harmonics keep their bits."""
+        """The model in the new coordinates, in its own dtype. Unturned, quaternions and harmonics keep their bits."""
         if not np.array_equal(self.rotation, np.eye(3)):
             w, x, y, z = quaternions(self.rotation[None])[0]
             product = torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]).to(gaussians.means)

@@ -72,8 +72,9 @@ def save_spz(
 
 
 def read_spz(path: Path) -> tuple[Gaussians, bool]:
-    """A model (`formats.Read`) in x right, y down, z forward, on the CPU. Raises `InputError` where the file is no
-    whole .spz, needs zstandard (version 4), or unpacks to more than `MOST_UNPACKED` times its bytes, or than fits."""
+    """A model (`formats.Read`) in x right, y down, z forward, on the CPU. Raises `InputError` where the file is not a
+    whole one of this format, needs zstandard (version 4), or unpacks to more than `MOST_UNPACKED` times its bytes, or
+    than the memory takes."""
     version, bits, flags, (means, opacities, colors, scales, rotations, harmonics) = _unpacked(path)
     if version == 1:
         warnings.warn(f"{path} is of version 1, which has positions in half precision: export it again", stacklevel=2)

@@ -142,7 +142,8 @@ def save_gsplat(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, a
 
 def read_gsplat(state: Mapping[str, Any], path: str | Path) -> Gaussians:
     """The model in a state that gsplat's trainer saved, in the file's own coordinates; float64, on the CPU, perhaps
-    with rows that are not finite. Raises `InputError`, about the file `path`, for parameters that lack or misfit."""
+    with rows that are not finite. Raises `InputError`, about the file `path`, where parameters are missing or of other
+    shapes."""
     splats = state["splats"] if isinstance(state["splats"], Mapping) else {}
     if missing := [name for name in PARAMETER_NAMES if not isinstance(splats.get(name), Tensor)]:
         present = ", ".join(sorted(map(str, splats))[:8]) or "nothing"
