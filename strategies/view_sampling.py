@@ -49,8 +49,8 @@ class RandomViewSampler:
     """Uniformly random views, none twice until nearly all have been seen, as in 3DGS.
 
     Views come from a shuffled stack. Drawn views leave it, and it is filled again when fewer than K are left. Doubted
-    photos (`doubted`) come onto it in one of five rounds, which 3DGS has not: one wrong pose among 37 costs .10 dB
-    without, and nothing with it; four cost 1.31 and .31 dB (fox, two seeds, from 1.5 times and 5 spreads on).
+    photos (`doubted`) come onto it in one of five rounds, which 3DGS has not: four wrong poses among 37 cost 1.31 dB
+    without that, .31 with it, one costs .10 and nothing (fox, two seeds, doubted from 1.5 times and 5 spreads on).
     """
 
     stack: np.ndarray = field(init=False, repr=False, compare=False)  # the views left, int64
