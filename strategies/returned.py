@@ -10,7 +10,7 @@ from torch import Tensor
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.protocols import DensityController, PixelSampler, SparseLoss
-from turbogs_plugin.types import PARAMETER_NAMES, LossOutput, PixelSamples, RowUpdate
+from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, LossOutput, PixelSamples, RowUpdate
 
 
 def require_type(value: object, kind: type, strategy: object) -> None:
@@ -26,14 +26,22 @@ def require_samples(samples: PixelSamples, view_ids: Sequence[int], sizes: np.nd
         if not np.array_equal(found, wanted):
             said = f"returned samples with {what} {np.array(found).tolist()}, not {np.array(wanted).tolist()}"
             raise InputError(f"{type(sampler).__name__} {said}: give view_ids, and masks [K, H, W], to from_mask")
+    ids, weights, most = samples.pixel_ids, samples.weights, int(sizes.prod(axis=1).max())
+    if weights is not None and weights.shape != ids.shape:
+        raise InputError(f"{type(sampler).__name__} returned {len(weights)} weights for {len(ids)} slots")
+    if ids.device.type == "cpu" and len(ids) and int(ids.max()) >= most:  # a GPU would be waited for
+        raise InputError(f"{type(sampler).__name__} returned pixel {int(ids.max())} of views of at most {most} pixels")
 
 
-def require_rows(update: RowUpdate, controller: DensityController, old_count: int) -> None:
-    """Raise `InputError` unless the parts of a change of `old_count` rows fit together."""
+def require_rows(update: RowUpdate, controller: DensityController, gaussians: Gaussians) -> None:
+    """Raise `InputError` unless the parts of a change of these rows fit together."""
     require_type(update, RowUpdate, controller)
+    old_count, shapes = len(gaussians), {name: value.shape[1:] for name, value in gaussians.items()}
     count, kind = len(update.source), update.source.dtype
     wrong = [f"values of {name}" for name in update.values if name not in PARAMETER_NAMES]
-    wrong += [f"{len(value)} values of {name}" for name, value in update.values.items() if len(value) != count]
+    for name, value in update.values.items():
+        if name in shapes and value.shape != (count, *shapes[name]):
+            wrong.append(f"values of {name} of shape {tuple(value.shape)}, not {(count, *shapes[name])}")
     wrong += [f"fresh of {len(update.fresh)} rows"] if len(update.fresh) != count else []
     if kind != torch.int64:
         wrong.append(f"source of {kind}")
@@ -58,6 +66,7 @@ def require_output(output: LossOutput, colors: Tensor, loss: SparseLoss) -> None
     require_type(output, LossOutput, loss)
     shapes = {"loss": (), "color_gradients": tuple(colors.shape), "pixel_errors": (len(colors),)}
     for field, shape in shapes.items():
-        found = tuple(getattr(output, field).shape)
-        if found != shape:
+        value = getattr(output, field)
+        require_type(value, Tensor, loss)
+        if (found := tuple(value.shape)) != shape:
             raise InputError(f"{type(loss).__name__} returned {field} of shape {found}, not {shape}")

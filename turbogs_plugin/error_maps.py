@@ -141,12 +141,13 @@ class ErrorMaps:
             step: gives the stamp.
 
         Raises:
-            InputError: another shape; nothing is changed.
+            InputError: another shape, or samples of views of other sizes; nothing is changed.
         """
         if pixel_errors.shape != (len(samples),):
-            raise InputError(
-                f"pixel errors have shape {tuple(pixel_errors.shape)}, expected ({len(samples)},): one for each sample"
-            )
+            expected = f"expected ({len(samples)},): one for each sample"
+            raise InputError(f"pixel errors have shape {tuple(pixel_errors.shape)}, {expected}")
+        if not np.array_equal(samples.sizes, known := self.sizes[list(samples.view_ids)]):
+            raise InputError(f"samples are of views of sizes {samples.sizes.tolist()}, maps {known.tolist()}")
         self.fetch(samples.view_ids)
         stamp = self.stamp(step)
         maps, stamps = self._arrays

@@ -289,6 +289,9 @@ def test_other_cameras_and_gradients_that_are_wanted_are_refused_by_name():
         (gaussians, cameras, r"cameras are of views \[0, 1, 2\], samples of \[0, 1\]: give cameras.select"),
         (gaussians, cameras.select([1, 0]), r"cameras are of views \[1, 0\], samples of \[0, 1\]"),
         (wanted, cameras.select([0, 1]), "rasterize makes no graph"),
+        (gaussians.map(torch.Tensor.float), cameras.select([0, 1]), "cameras are of torch.float64, Gaussians of torch"),
+        (gaussians.map(lambda value: value[..., None]), cameras.select([0, 1]), r"means is \(5, 3, 1\) of torch"),
+        (gaussians, make_cameras([(20, 18)] * 2), r"cameras have sizes \[\[20, 18\], .* samples \[\[20, 20\]"),
         (gaussians.map(torch.Tensor.half), cameras.select([0, 1]), "means are of torch.float16: give float32"),
     ):
         with pytest.raises(InputError, match=words):

@@ -19,7 +19,8 @@ def of_views(scene: Scene, viewmats: torch.Tensor) -> Scene:
     count, views = len(viewmats), scene.train
     cameras = Cameras(viewmats, views.cameras.Ks[:count], views.cameras.sizes[:count])
     photos = Photos(views.photos.colors[: count * 40 * 24], views.photos.sizes[:count])
-    return replace(scene, train=replace(views, cameras=cameras, names=views.names[:count], photos=photos))
+    chosen = replace(views, cameras=cameras, names=views.names[:count], photos=photos, observations=None)
+    return replace(scene, train=chosen, test=replace(scene.test, observations=None))
 
 
 def test_counts_sizes_and_bytes(scene):

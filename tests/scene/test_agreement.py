@@ -111,5 +111,8 @@ def test_good_captures_pass_by_a_wide_margin(scene):
 def test_what_cannot_be_told_passes(scene):
     other = foreign(scene)
     require_agreement(replace(other, point_colors=torch.full_like(scene.point_colors, 128)))  # clouds without colours
-    require_agreement(replace(other, points=scene.points[:40], point_colors=other.point_colors[:40]))
+    unseen = {name: replace(getattr(other, name), observations=None) for name in ("train", "test")}
+    with pytest.raises(InputError, match=r"photos show point \d+, and the scene has 40 points: .* observations=None"):
+        replace(other, points=scene.points[:40])
+    require_agreement(replace(other, points=scene.points[:40], point_colors=other.point_colors[:40], **unseen))
     require_agreement(replace(other, points=scene.points + 100.0, drawn_points=True))

@@ -18,6 +18,7 @@ import pycolmap
 import pytest
 import torch
 from helpers.framework_runs import assert_identical, stop_after, tiny_config, tiny_settings, tiny_trainer
+from helpers.optimizers import make_gaussians
 from helpers.processes import ended, said, start_ranks
 from PIL import Image
 
@@ -328,8 +329,9 @@ def test_more_views_an_iteration_than_a_gpu_takes_are_refused_before_anything_is
         run.new_loop(config, SimpleNamespace(train=range(150)), torch.device("cuda"))
 
 
-def own_sampler(*size, named=True):
-    return SimpleNamespace(sample=lambda _, ids, *__: PixelSamples.from_mask(torch.ones(4, *size) > 0, *[ids] * named))
+def own_sampler(*size, named=True, **changes):
+    mask = torch.ones(4, *size) > 0
+    return SimpleNamespace(sample=lambda _, ids, *__: replace(PixelSamples.from_mask(mask, *[ids] * named), **changes))
 
 
 class OwnLoss(SparseLoss):
@@ -344,6 +346,7 @@ class OwnLoss(SparseLoss):
     [
         ("pixel_sampler", own_sampler(24, 40, named=False), r"view_ids \[0, .*, not .*give view_ids, and masks"),
         ("pixel_sampler", own_sampler(40, 24), r"sizes \[\[24, 40\].*, not \[\[40, 24\].*masks \[K, H, W\]"),
+        ("pixel_sampler", own_sampler(24, 40, weights=torch.ones(3)), "returned 3 weights for [0-9]+ slots"),
         ("loss", OwnLoss(), r"returned pixel_errors of shape \(\d+, 3\), not \(\d+,\)"),
     ],
 )
@@ -364,7 +367,7 @@ ROWS, SAME = torch.arange(3), torch.zeros(3, dtype=torch.bool)
     ("update", "message"),
     [
         (RowUpdate(ROWS, SAME, {"scale": torch.zeros(3, 3)}), "with values of scale"),
-        (RowUpdate(ROWS, SAME, {"scales": torch.zeros(4, 3)}), "of 3 rows with 4 values of scales"),
+        (RowUpdate(ROWS, SAME, {"scales": torch.zeros(4, 3)}), r"values of scales of shape \(4, 3\), not \(3, 3\)"),
         (RowUpdate(ROWS, SAME[:2], {}), "with fresh of 2 rows"),
         (RowUpdate(~SAME, SAME, {}), r"with source of torch\.bool: source has old rows, as of torch\.nonzero"),
         (RowUpdate(ROWS + 1, SAME, {}), r"with source 1 \.\. 3 of 3 old rows"),
@@ -373,7 +376,7 @@ ROWS, SAME = torch.arange(3), torch.zeros(3, dtype=torch.bool)
 )
 def test_a_change_of_rows_that_does_not_fit_together_is_refused(update, message):
     with pytest.raises(InputError, match=message):
-        require_rows(update, NoDensity(), 3)
+        require_rows(update, NoDensity(), make_gaussians(3))
 
 
 def test_statistics_that_do_not_follow_their_gaussians_are_named():

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,15 +20,31 @@ from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
 
 def rasterize(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:
     """`Engine.render` by the engine of the Gaussians' device; `options` are the fields of `RenderOptions`. Raises
-    `InputError`: cameras of other views than the samples', or Gaussians in half precision or with gradients wanted."""
+    `InputError`: cameras of another number, order or image size than the samples' views, Gaussians of other shapes or
+    types, or with gradients wanted. Cameras that were not selected by number are taken for those of the views."""
     rows, views = cameras.by_row()[2], samples.view_ids
     if len(rows) != len(views) or (isinstance(rows, tuple) and sorted(rows) == sorted(views) and rows != views):
         raise InputError(f"cameras are of views {list(rows)}, samples of {list(views)}: give cameras.select(view_ids)")
-    if gaussians.means.dtype not in (torch.float32, torch.float64):
-        raise InputError(f"means are of {gaussians.means.dtype}: give float32, by gaussians.map(torch.Tensor.float)")
+    if not np.array_equal(cameras.sizes, samples.sizes):
+        raise InputError(f"cameras have sizes {cameras.sizes.tolist()}, samples {samples.sizes.tolist()}")
+    _require_model(gaussians, cameras)
     if torch.is_grad_enabled() and any(value.requires_grad for _, value in gaussians.items()):
         raise InputError("rasterize makes no graph: render under torch.no_grad(), or by rasterize_differentiable")
     return engine_of(gaussians.device).render(gaussians, cameras, samples, RenderOptions(**options))
+
+
+def _require_model(gaussians: Gaussians, cameras: Cameras) -> None:
+    """Raise `InputError` unless parameters have their shapes and, as the cameras, one type of a kernel's."""
+    count, kind = len(gaussians), gaussians.means.dtype
+    if kind not in (torch.float32, torch.float64):
+        raise InputError(f"means are of {kind}: give float32, by gaussians.map(torch.Tensor.float)")
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
+    for name, value in gaussians.items():
+        shape = (count, *shapes.get(name, (*value.shape[1:2], 3)))
+        if tuple(value.shape) != shape or value.dtype != kind:
+            raise InputError(f"{name} is {tuple(value.shape)} of {value.dtype}: expected {shape} of {kind}, as means")
+    if (own := cameras.by_row()[0].dtype) != kind:
+        raise InputError(f"cameras are of {own}, Gaussians of {kind}: give cameras.to(dtype={kind})")
 
 
 def dense_samples(cameras: Cameras, view_ids: Sequence[int] | None = None) -> PixelSamples:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene.frame import Frame
 from turbogs_plugin.scene.photos import Photos
@@ -59,7 +60,7 @@ class Scene:
     Args:
         name: of the scene's folder.
         train, test: the two disjoint sets of views.
-        points: [M, 3] float32.
+        points: [M, 3] float32. Observations of the views count in them.
         point_colors: [M, 3] uint8.
         frame: back to the capture's own coordinates.
         extent: 1.1 times the largest distance of a training camera from their mean, as in 3DGS; 1 by the choice of
@@ -82,6 +83,12 @@ class Scene:
     reprojection_error: float | None = None
     doubt: str = ""
     notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for observations in (self.train.observations, self.test.observations):
+            if observations and (most := int(observations.point_ids.max())) >= len(self.points):
+                trouble = f"photos show point {most}, and the scene has {len(self.points)} points"
+                raise InputError(f"{trouble}: with other points, give train and test views observations=None")
 
     def __repr__(self) -> str:
         width, height = self.train.cameras.sizes[0]

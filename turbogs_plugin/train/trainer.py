@@ -132,7 +132,7 @@ class Trainer(TrainingState):
         until `refine_until`. Not in the paper: what stands right before a camera goes with any change; and the size of
         distant Gaussians is limited, every `RESTRAIN_EVERY` iterations, also without a change."""
         if update is not None:
-            require_rows(update, self.density, len(self.gaussians))
+            require_rows(update, self.density, self.gaussians)
             if self.clearance is not None:
                 update = self.clearance.clear(update, self.gaussians)
             if len(update.source) == 0:

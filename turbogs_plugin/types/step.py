@@ -14,7 +14,7 @@ class Step:
         total: T, iterations of the whole run.
         refine_until: tau_until, the last iteration of densification.
         seed: of the run; all randomness is a function of (seed, iteration, place).
-        scene_extent: radius of the camera centres about their mean, world units.
+        scene_extent: 1.1 times the largest distance of a camera from their mean, in world units (`Scene.extent`).
     """
 
     iteration: int
