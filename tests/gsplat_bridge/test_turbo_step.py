@@ -186,6 +186,15 @@ def test_steps_states_and_rows_that_do_not_fit_are_refused():
     assert_refused(r"splats\['means'\] has 41 rows, not 40 as before", turbo.step, 1)
 
 
+def test_poses_in_other_axes_are_told_at_the_first_step():
+    views = [
+        view | {"camtoworld": view["camtoworld"] @ torch.diag(torch.tensor([1.0, -1, -1, 1]))} for view in make_views()
+    ]
+    turbo = TurboStep(make_splats(), views, max_steps=STEPS, overrides=SMALL[0])
+    with pytest.warns(UserWarning, match="no sample of the first step shows a Gaussian: camtoworld must be"):
+        turbo.step(0)
+
+
 def test_our_length():
     assert TurboStep.proposed_steps(65) == 3900 and TurboStep.proposed_steps(3) == 2000
     assert TurboStep(make_splats(), make_views()).max_steps == 2000

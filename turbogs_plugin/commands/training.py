@@ -151,7 +151,8 @@ def demo(path: Positional[Path], /) -> int:
     """
     from turbogs_plugin.captures import write_demo_capture
 
-    print(f"capture  {write_demo_capture(path)}")
+    folder = write_demo_capture(path)
+    print(f"capture  {folder}\nnext     turbogs train {shlex.quote(str(folder))} --out RUN --config demo")
     return 0
 
 

@@ -177,7 +177,8 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         path, separator, text = override.partition("=")
         keys = path.strip().split(".")
         if not separator or len(keys) < 2 or not all(keys):
-            meant = " or ".join(f"{name}={text or 'VALUE'}" for name in settings_named(path.strip()))
+            value = "VALUE" if text[:1] in "{[" else text
+            meant = " or ".join(f"{name}={value}" for name in settings_named(path.strip()))
             meant = f"--config {path} (in Python, config='{path}')" if path in config_names() else meant
             hint = f": write {meant}" if meant else ""
             raise InputError(f"override '{override}' is not of the form section.key=value{hint}")

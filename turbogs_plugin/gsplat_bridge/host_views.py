@@ -35,8 +35,9 @@ def read_items(
         InputError: it has no items by number, or cuts random patches (``patch_size``); or an image is no tensor
             [H, W, 3], or not within 0 .. `white`; or a mask has another size.
     """
-    if not (hasattr(trainset, "__len__") and hasattr(trainset, "__getitem__")) or not len(trainset):
+    if not (hasattr(trainset, "__len__") and hasattr(trainset, "__getitem__")):
         raise InputError(f"{name} is a {type(trainset).__name__}: expected a data set with items by number, no loader")
+    require(len(trainset) > 0, f"length of {name}", len(trainset), "1 or more photos")
     if getattr(trainset, "patch_size", None) is not None:
         raise InputError(f"{name} needs whole images, its patch_size is {trainset.patch_size}: leave patch_size out")
 

@@ -3,9 +3,10 @@ everything around the step is the host's."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -54,8 +55,8 @@ class StepInfo:
     loss: Tensor  # [] float32 on the host, before the update; on a GPU that of a step 16 to 31 before
     num_gaussians: int  # after the step
     num_samples: int  # pixels of the step, empty slots among them
-    _colors: Tensor
-    _truth: PhotoSamples
+    _colors: Tensor = field(repr=False)
+    _truth: PhotoSamples = field(repr=False)
 
     @property
     def psnr(self) -> float:
@@ -122,7 +123,7 @@ class TurboStep:
         device, degree = gaussians.device, gaussians.sh_degree
         images = posed_images(views, white)
         own = ("train.exposure=false", "train.init=points", f"train.sh_degree={degree}")
-        settings = load_config(config, (*overrides, *own))
+        settings = load_config(config, (*([overrides] if isinstance(overrides, str) else overrides), *own))
         if max_steps is not None:
             require(max_steps >= 1, "max_steps", max_steps, "at least 1")
             settings = with_iterations(settings, int(max_steps))
@@ -130,6 +131,7 @@ class TurboStep:
         settings = make_plan(settings, world, device).apply(settings)
         settings.train.seed = torch.initial_seed() % 2**31
         self.trainer = HostTrainer(self, settings, world, device)
+        rates = [rates] if isinstance(rates, str) else rates
         if rates:
             require_keys(self.optimizers, rates, "optimizers", "rates are of parameters whose optimizer is given")
             kind, known = settings.optimizer["type"], "learning_rates" in settings.optimizer
@@ -149,8 +151,10 @@ class TurboStep:
     def step(self, step: int) -> StepInfo:
         """Make the step of this number, `steps`. Raises `InputError` for another, or another number of Gaussians."""
         require_one_process("TurboStep")
-        if step != self.steps or step >= self.max_steps:
-            raise InputError(f"step is {step}: expected {self.steps}, the next one, below max_steps = {self.max_steps}")
+        if step != self.steps:
+            raise InputError(f"step is {step}: expected {self.steps}, the next one")
+        if step >= self.max_steps:
+            raise InputError(f"step is {step}: all {self.max_steps} steps are made (max_steps)")
         trainer = self.trainer
         if self._begun:
             self._take_changes()
@@ -163,6 +167,9 @@ class TurboStep:
             self._catch_up()
             trainer.conclude()
         output, colors, truth = trainer.seen
+        if step == 0 and not colors.any():  # the only step for which the host waits
+            remedy = "camtoworld must be camera to world, x right, y down, z forward, in the world of the splats"
+            warnings.warn(f"no sample of the first step shows a Gaussian: {remedy}", stacklevel=2)
         self._losses.source.copy_(output.loss)  # an engine may use the memory of its own again
         loss = torch.tensor(self._losses.read()[0], dtype=torch.float32)
         return StepInfo(loss, len(trainer.gaussians), len(truth.samples), colors, truth)

@@ -170,7 +170,9 @@ class StudyFolder:
         """Everything that the folder has, of ``results.json`` and of the cells' own files. Raises `InputError`: no
         study, or a file that is wrong, which is named."""
         if not self.file.is_file():
-            raise InputError(f"'{self.path}' holds no study: there is no {self.file.name}")
+            is_run = (self.path / "config.yaml").is_file()
+            hint = "; it is a run: give two or more, and --out NEW" if is_run else ""
+            raise InputError(f"'{self.path}' holds no study: there is no {self.file.name}{hint}")
         study = _parsed(self.file)
         parts = [study, *(_parsed(path) for path in self.cells.glob("*/*.json"))]
         found = {result.key: result for part in parts for result in part.results}

@@ -32,10 +32,9 @@ COMPARED = ("psnr", "refined_psnr", "ssim", "refined_ssim")
 """Measures beside which a column has the difference from the baseline."""
 
 HOW_TO_READ = (
-    "Seconds of training are the initial error maps and the iterations, on one clock for all cells, without loading, "
-    "evaluation and reports. A process first trains a short copy of each variant and throws it away. A number is the "
-    "mean over seeds with its standard error. A difference is of two such means; it is clear where noise alone would "
-    "make as large a one in fewer than one case of twenty (Welch's t-test, at least three seeds of each). "
+    "Seconds of training are the initial error maps and the iterations, without loading, evaluation and reports. A "
+    "number is the mean over seeds with its standard error. A difference is of two such means; it is clear where noise "
+    "alone would make as large a one in fewer than one case of twenty (Welch's t-test, at least three seeds of each). "
     "Seconds to a PSNR are linear between evaluations."
 )
 
