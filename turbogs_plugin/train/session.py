@@ -194,7 +194,8 @@ class RunSession(Listener):
 
     def _last_good(self) -> str:
         checkpoint = latest_checkpoint(self.folder.checkpoints)
-        return f"the last good checkpoint is '{checkpoint}'" if checkpoint else "no checkpoint was saved before"
+        good = f"the last good checkpoint is '{checkpoint}'{self.folder.older()}"
+        return good if checkpoint else "no checkpoint was saved before"
 
 
 class TrainingProgress(Listener):
