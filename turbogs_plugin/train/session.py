@@ -193,9 +193,8 @@ class RunSession(Listener):
         self.clock.mark("checkpoints")
 
     def _last_good(self) -> str:
-        checkpoint = latest_checkpoint(self.folder.checkpoints)
-        good = f"the last good checkpoint is '{checkpoint}'{self.folder.older()}"
-        return good if checkpoint else "no checkpoint was saved before"
+        checkpoint, older = latest_checkpoint(self.folder.checkpoints), self.folder.older()
+        return f"the last good checkpoint is '{checkpoint}'{older}" if checkpoint else "no checkpoint was saved before"
 
 
 class TrainingProgress(Listener):
