@@ -209,8 +209,8 @@ def test_a_run_whose_capture_moved_goes_on_with_another_path(turbogs, finished, 
     file = moved / "config.yaml"
     file.write_text(file.read_text().replace(str(capture), str(tmp_path / "gone")))
     (moved / "report.md").unlink()  # so that there is something left to do
-    for arguments in (["eval", moved], ["render", moved], ["train", "--resume", moved]):
-        assert_refused(turbogs(*arguments), tmp_path / "gone", "no such scene")
+    for words in (["eval"], ["render"], ["view"], ["export", "--max-gaussians", 5], ["train", "--resume"]):
+        assert_refused(turbogs(*words, moved), f"{tmp_path / 'gone'} does not exist; '{file}' names it as scene.path")
     file.write_text(file.read_text().replace(str(tmp_path / "gone"), str(capture)))
     assert turbogs("eval", moved)[0] == 0
 

@@ -125,6 +125,14 @@ def test_photos_that_cannot_be_solved_end_in_one_line_and_leave_nothing(tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
+def test_a_full_disk_is_refused_and_a_failure_of_pycolmap_is_one_line(solved, tmp_path, monkeypatch):
+    monkeypatch.setattr(solver, "extract_features", lambda database, *others: pycolmap.Database.open(tmp_path))
+    assert_refused("database factory.*: make room .* repeat the call", reconstruct, solved[0], tmp_path / "scene")
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: SimpleNamespace(free=3 << 20))
+    assert_refused("MiB .* has 3 MiB free: make room", reconstruct, solved[0], tmp_path / "new")
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
 def test_a_place_that_holds_something_else_is_refused(solved, tmp_path):
     photos, _ = solved
     (tmp_path / "file").write_text("x")

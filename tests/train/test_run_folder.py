@@ -95,7 +95,7 @@ def test_a_run_that_ends_before_its_first_checkpoint_does_not_claim_its_folder(c
 
 @pytest.mark.parametrize("error", [InputError("bad"), IndexError("bad")])
 def test_an_overwritten_run_comes_back_where_the_new_one_fails(capture, tmp_path, monkeypatch, error):
-    """And goes where the new one has a checkpoint. Nothing but a run is overwritten."""
+    """And goes where the new one is finished, be it after a stop. Nothing but a run is overwritten."""
     folder, config = RunFolder(tmp_path / "run"), tiny_config(capture, "train.iterations=2", "train.evaluate_at=[]")
     run.train(config, folder.path)
     before = {path.name: path.stat().st_ino for path in folder.path.iterdir()}
@@ -107,7 +107,11 @@ def test_an_overwritten_run_comes_back_where_the_new_one_fails(capture, tmp_path
         other.touch()
         assert_refused(str(other), run.train, config, folder.path, overwrite=True)
         other.unlink()
-    run.train(config.changed(train={"seed": 5}), folder.path, overwrite=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "step", lambda each, step=Trainer.step: (signal.raise_signal(signal.SIGINT), step(each)))
+        run.train(config.changed(train={"seed": 5}), folder.path, overwrite=True)
+    assert folder.older() and RunFolder(folder.aside).finished(reported=False)
+    run.resume(folder.path)
     assert folder.read_config().train.seed == 5 and not folder.aside.exists()
 
 

@@ -43,8 +43,8 @@ def train(
         overrides: changes of the configuration, e.g. train.iterations=8000 density.type=none; turbogs plan without a
             SCENE lists all settings.
         out: new folder for the run.
-        overwrite: replace a run that --out holds. It is put aside until the new one ends, and comes back if that fails
-            before its first checkpoint.
+        overwrite: replace a run that --out holds. It lies in RUN.replaced until the new one is finished, and comes back
+            if that fails before its first checkpoint.
         resume: folder of a stopped run to go on with, by its own configuration.
         report: at the end, write the report and its pictures; --no-report leaves model, history and checkpoints.
         viewer: show the training in a browser, at this port (or 8080); afterwards its model, until Ctrl-C.
@@ -163,8 +163,9 @@ def _tell(session: RunSession, reported: bool) -> int:
         from turbogs_plugin.config.components import foreign_code
 
         trust = ["--trust"] if foreign_code(session.trainer.config.to_mapping()) else []
-        words = ["--resume", shlex.quote(str(folder.path)), *trust]
-        print("stopped and saved: go on with  turbogs train", *words, file=sys.stderr)
+        path, aside = shlex.quote(str(folder.path)), shlex.quote(str(folder.aside))
+        back = f"{older}: to have it back,  rm -r {path} && mv {aside} {path}" if (older := folder.older()) else ""
+        print("stopped and saved: go on with  turbogs train --resume", " ".join([path, *trust]) + back, file=sys.stderr)
         return 128 + session.signal
     wall = session.wall.wall_seconds
     print(f"trained {session.wall.train_seconds:.1f} s" + ("" if wall is None else f", {wall:.1f} s on the wall"))

@@ -31,6 +31,8 @@ SMALL = 1000
 """Photos whose longer side is shorter, in px, show too little without features at twice their size."""
 ENOUGH_OF_MANY = 0.95
 """Share of more than `FEW` photos that is enough; of fewer, all must register, or more features are looked for."""
+PHOTO_BYTES = 2 << 20
+"""Room for a photo in a database: 8192 features of 152 bytes at most, and their matches."""
 SMALLEST_SHARE = 0.5
 """A model with a smaller share of the photos is not taken for the scene."""
 
@@ -80,7 +82,7 @@ def reconstruct(photos: Path, out: Path) -> Solution:
 
     A call for photos of an earlier call that was stopped repeats no finished step; a finished reconstruction is told
     again. Masks are put in place at each call; a mask that is gone stays in the capture. Raises `InputError`: photos or
-    folder are not usable, or the photos cannot be solved. Then a new folder `out` is gone."""
+    folder are not usable, or the photos cannot be solved, and a new folder `out` is gone; or pycolmap failed."""
     load_pycolmap()  # an absent package is told before photos are read
     found = read_photos(photos)
     place, _ = find_photos(photos)
@@ -98,6 +100,9 @@ def reconstruct(photos: Path, out: Path) -> Solution:
         if new:
             shutil.rmtree(out)
         raise
+    except RuntimeError as error:  # pycolmap's
+        remedy = f"make room on its disk and repeat the call, which goes on; if that fails, too, remove '{out}'"
+        raise InputError(f"pycolmap failed in '{out / 'reconstruction'}' ({error}): {remedy}") from error
 
 
 def scene_beside(photos: Path, run: Path) -> Path:
@@ -146,13 +151,17 @@ def _read_solution(out: Path) -> Solution | None:
 def _reconstruct(photos: Sequence[PhotoFile], out: Path, others: str) -> Solution:
     """Solve the photos and write the scene. `others`: files beside the photos that are not read, for a note."""
     scratch, images, names = out / "reconstruction", out / "images", [photo.name for photo in photos]
+    efforts = (True,) if max(max(photo.size) for photo in photos) < SMALL else (False, True)
+    needed = PHOTO_BYTES * len(efforts) * len(photos) - sum(file.stat().st_size for file in scratch.glob("*.db"))
+    if (free := shutil.disk_usage(scratch).free) < needed:  # SQLite's error could end the process
+        room = f"needs about {needed / 2**20:,.0f} MiB for features and matches, and its disk has {free / 2**20:,.0f}"
+        raise InputError(f"'{scratch}' {room} MiB free: make room there, or choose an --out on another disk")
     images.mkdir(exist_ok=True)
     place_photos(photos, images)
     enough = len(photos) if len(photos) <= FEW else ENOUGH_OF_MANY * len(photos)
     best: Solve | None = None
     moved: list[str] = []
-    small = max(max(photo.size) for photo in photos) < SMALL
-    for doubled in (True,) if small else (False, True):
+    for doubled in efforts:
         database = scratch / f"features{'-doubled' * doubled}.db"
         solver.extract_features(database, images, photos, doubled)
         pairs, reason = choose_pairs(names, solver.read_positions(database, names))

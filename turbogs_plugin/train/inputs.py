@@ -6,6 +6,7 @@ import importlib
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
@@ -44,16 +45,18 @@ def show_loading(loaded: int, total: int) -> None:
         print(text, end="", file=sys.stderr, flush=True)
 
 
-def open_scene(settings: SceneConfig, refine: bool, ranks: Ranks = ONE, trained: bool = False) -> Scene:
+def open_scene(settings: SceneConfig, refine: bool, ranks: Ranks = ONE, trained: Path | None = None) -> Scene:
     """A capture. On a terminal, its photos are counted while they are decoded. Raises `InputError`: there is no usable
     capture, or no training on it can work.
 
     Args:
         refine: `train.refine_cameras`.
-        ranks: the processes that train together; each calls this. The first one refines cameras for all: machines
-            differ in their last digits, and replicas may not.
-        trained: a run has begun on it, so it is not asked again whether training on it can work.
+        ranks: the processes that train together; each calls this. The first refines cameras: last digits may differ.
+        trained: the configuration of a run that has begun on it: whether training on it can work is not asked again.
     """
+    if trained and not Path(settings.path).exists():
+        named = f"{settings.path} does not exist; '{trained}' names it as scene.path"
+        raise InputError(f"no such scene: {named}: write its new place there")
     first, found = ranks.first, list[RefinedCameras | None]()
     how = settings.factor, settings.test_every, show_loading if first else None, settings.validation
     scene = load_scene(settings.path, *how, lambda read: found.append(find_cameras(read, refine)) if first else None)
@@ -69,7 +72,7 @@ def open_scene(settings: SceneConfig, refine: bool, ranks: Ranks = ONE, trained:
 
 
 def open_started(
-    config: Config, clock: WallClock, ranks: Ranks = ONE, trained: bool = False
+    config: Config, clock: WallClock, ranks: Ranks = ONE, trained: Path | None = None
 ) -> tuple[Scene, torch.device]:
     """The capture, and the device with its kernels loaded: a thread starts it, in a second or more, while photos are
     decoded. Both are marked on the clock of the wall. Arguments and errors as of `open_scene`. Where one process ends

@@ -242,7 +242,7 @@ def resume(
         if checkpoint is None and model.is_file():
             raise InputError(f"'{folder.path}' is finished and has no checkpoint to go on from: use its {model.name}")
         state = None if checkpoint is None else load_checkpoint(checkpoint)
-        scene, device = open_started(config, clock, ranks, trained=True)
+        scene, device = open_started(config, clock, ranks, trained=folder.config)
         hold_to_limit(config, device)
         with _fitting(scene):
             trainer = Trainer(config, scene, device, ranks.engine(device), resuming=state is not None)

@@ -28,6 +28,7 @@ class RunFolder:
         self.lock, self.owner = path / ".lock", path / ".owner"
         self.checkpoints, self.model, self.report = path / "checkpoints", path / "model.ply", path / "report.md"
         self.renders, self.aside = path / "renders", Path(f"{path}.replaced")
+        self._mark = ".replaced"  # the name of a file in the run that lies in `aside`, so that no other is removed
         self._begun = (self.asked, self.config, self.plan, self.history, self.checkpoints)
 
     def require_new(self, overwrite: bool = False) -> None:
@@ -38,7 +39,7 @@ class RunFolder:
                 remedy = "choose a new folder; --resume goes on with a run, --overwrite replaces one"
                 raise InputError(f"--out '{self.path}' is not empty: {remedy}")
             ours = {*self._begun, self.lock, self.owner, self.wall, self.metrics, self.model, self.report, self.renders}
-            ours |= {self.path / "report", self.path / "export.ply", *self.path.glob("model.*")}
+            ours |= {*map(self.path.joinpath, ("report", "export.ply", self._mark)), *self.path.glob("model.*")}
             if others := {*self.path.iterdir()} - ours:
                 raise InputError(f"--overwrite: '{min(others)}' is of no training: take it out of the folder first")
             if self.aside.exists():
@@ -61,29 +62,34 @@ class RunFolder:
 
     @contextmanager
     def replaced(self) -> Iterator[None]:
-        """While entered, the run that the folder holds lies in `aside`. At the end it is removed; or it comes back,
-        where the new one has no checkpoint. Raises `InputError` where another process writes to it."""
+        """Put the run that the folder holds into `aside`, until the new one is finished (`owned`). At the end it comes
+        back where the new one has no checkpoint. Raises `InputError` where another process writes to it."""
         if not self.path.exists() or self._unclaimed():
             yield
             return
         with self.owned():
             self.owner.unlink()
+            (self.path / self._mark).touch()
             self.path.rename(self.aside)
-        print(f"turbogs: the older run lies in '{self.aside}' until this one ends", file=sys.stderr)
+        print(f"turbogs: the older run lies in '{self.aside}' until this one is finished", file=sys.stderr)
         try:
             yield
         finally:
-            failed = not self.path.exists() or self._unclaimed()
-            shutil.rmtree(self.path if failed else self.aside, ignore_errors=True)
-            if failed:
+            if not self.path.exists() or self._unclaimed():
+                shutil.rmtree(self.path, ignore_errors=True)
+                (self.aside / self._mark).unlink(missing_ok=True)
                 self.aside.rename(self.path)
+
+    def older(self) -> str:
+        """Where the run lies that this one replaces, for a message; nothing where there is none."""
+        return f"; the older run is in '{self.aside}'" if (self.aside / self._mark).is_file() else ""
 
     @contextmanager
     def owned(self, new: bool = False) -> Iterator[None]:
         """The folder, which is made where it is `new`, is this process's alone while entered. A line on stderr tells of
         an owner that was killed, whose lock the system has freed, and of a disk that knows no locks. Raises
         `InputError` where another process writes to it, or has written to a new one meanwhile. A new one that ends by
-        an `InputError`, from a strategy of one's own, say, before its first checkpoint is removed."""
+        an `InputError` before its first checkpoint is removed; so is the run in `aside` once its model is there."""
         from filelock import FileLock, Timeout  # of the extra `train`
 
         self.path.mkdir(parents=new, exist_ok=True)
@@ -100,7 +106,8 @@ class RunFolder:
             if new and not self._unclaimed():
                 raise InputError(f"--out '{self.path}' is not empty: another process has written to it meanwhile")
             if before := read_text(self.owner):
-                print(f"turbogs: {before[:80]!a} was killed: '{self.path}' is taken over from it", file=sys.stderr)
+                taken = f"'{self.path}' is taken over from it{self.older()}"
+                print(f"turbogs: {before[:80]!a} was killed: {taken}", file=sys.stderr)
             if new:  # what a run that failed has left
                 for file in (self.config, self.history):
                     file.unlink(missing_ok=True)
@@ -111,6 +118,8 @@ class RunFolder:
                 shutil.rmtree(self.path, ignore_errors=True)
             raise
         finally:
+            if self.model.is_file() and self.older():
+                shutil.rmtree(self.aside, ignore_errors=True)
             self.owner.unlink(missing_ok=True)
             lock.release()
 

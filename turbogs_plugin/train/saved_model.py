@@ -102,8 +102,9 @@ def load_with_capture(
         gaussians = gaussians.map(lambda value: value.to(device))
         return SavedModel(None, given, gaussians, scene.frame, None, None, antialiased), scene, ""
     model = load_model(path, device)
+    settings, refine = model.config.scene, model.config.train.refine_cameras
     try:
-        return model, open_scene(model.config.scene, model.config.train.refine_cameras, trained=True), ""
+        return model, open_scene(settings, refine, trained=RunFolder(path).config), ""
     except InputError as error:
         if needed:
             raise

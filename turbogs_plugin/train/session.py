@@ -193,8 +193,8 @@ class RunSession(Listener):
         self.clock.mark("checkpoints")
 
     def _last_good(self) -> str:
-        checkpoint = latest_checkpoint(self.folder.checkpoints)
-        return f"the last good checkpoint is '{checkpoint}'" if checkpoint else "no checkpoint was saved before"
+        checkpoint, older = latest_checkpoint(self.folder.checkpoints), self.folder.older()
+        return f"the last good checkpoint is '{checkpoint}'{older}" if checkpoint else "no checkpoint was saved before"
 
 
 class TrainingProgress(Listener):
