@@ -295,10 +295,10 @@ def _no_capture(scene: Path) -> InputError:
     """The error for a folder that is no capture: what it lacks."""
     if where := _elsewhere(scene):
         return InputError(where)
-    poses, call = other_poses(scene), f"'turbogs reconstruct {shlex.quote(str(scene))} --out SCENE'"
+    poses, call = other_poses(scene), f"turbogs reconstruct {shlex.quote(str(scene))} --out SCENE"
     if photos := find_photos(scene)[1]:
         known = f"{poses}; or" if poses else "nothing that says where they were taken from:"
-        return InputError(f"{scene} has {len(photos)} photos and {known} find the cameras by {call}, then use SCENE")
+        return InputError(f"{scene} has {len(photos)} photos and {known} find the cameras, then use SCENE:  {call}")
     return InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
         f"{', a '.join(READERS)}, nor photos; "
