@@ -77,6 +77,10 @@ def test_mip_nerf_360(tmp_path, kept):
     write_model(tmp_path / "garden/sparse/0", camera, NAMES)
     for reduction in kept:
         write_photos(tmp_path / f"garden/images_{reduction}".removesuffix("_1"), camera, NAMES, reduction)
+    model = tmp_path / "garden/sparse"
+    for given in (model, model / "0") if 1 in kept else ():
+        assert_refused(f"{given} lies in the capture {tmp_path / 'garden'}: give that folder", load_scene, given)
+        assert_refused(f"{tmp_path} is no capture, but has 1 in it: give {tmp_path / 'garden'}$", load_scene, tmp_path)
     for factor in {kept[0], 1}:
         scene = load_scene(tmp_path / "garden", factor)
         require_painted(scene)
@@ -175,7 +179,7 @@ def test_one_camera_a_photo_upright_and_lying(tmp_path, kind):
         (["images/1.xmp"], "1.xmp is not read, .* of RealityScan"),
         (["1_initial/params/p_calibrated_camera_parameters.txt"], "p_.*.txt is not read, .* or Pix4D"),
         (["distorted/sparse/0/cameras.bin"], "cameras.bin is not read, .* of COLMAP: move its folder to sparse/0"),
-        ([], "3 photos and nothing that says where .*: find the cameras, then use SCENE:  turbogs reconstruct .* SCENE$"),
+        ([], "3 photos and nothing that .*: find the cameras, then use SCENE:  turbogs reconstruct .* SCENE$"),
     ],
 )
 def test_cameras_of_other_programs_are_named(tmp_path, files, words):
