@@ -54,12 +54,9 @@ OTHER_POSES = {
 """Files that may have cameras and are not read, by what writes them and the way from there to a capture."""
 SPLITS = ("test.txt", "train.txt", "val.txt", "split.json", "train_test_lists.json", "transforms_test.json")
 """Files of splits, of which readers of other kinds of captures take none."""
-PARTS_OF_RUN = ("model.ply", "checkpoints", "report")
-"""One of these lies beside the config.yaml of a run that has begun."""
-LENS_PIXELS = 16
-"""Pixels of a lens's camera for each of the photo that is undistorted in the camera's size, at most."""
-FARTHEST = 1e15
-"""Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
+PARTS_OF_RUN = ("model.ply", "checkpoints", "report")  # one lies beside the config.yaml of a run that has begun
+LENS_PIXELS = 16  # pixels of a lens's camera for each of the photo that is undistorted in the camera's size, at most
+FARTHEST = 1e15  # distance of a point in extents, from which on squares, and squares of these, do not fit into float32
 
 
 def load_scene(

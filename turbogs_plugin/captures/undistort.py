@@ -23,12 +23,10 @@ if TYPE_CHECKING:
 LARGEST_SIDE = 65535  # most pixels of a photo's width or height: JPEG's own limit
 STRAIGHT_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """COLMAP's camera models that are a pinhole where all their parameters of distortion, if any, are 0."""
-WIDEST = math.tan(math.radians(60.0))
-"""Tangent of the largest angle off the axis in the pinhole image: a fisheye's rim would become a smear."""
+WIDEST = math.tan(math.radians(60.0))  # of the largest angle off the axis: a fisheye's rim would become a smear
 LARGEST_GROWTH = 2.0  # most that the pinhole image has of the photo's sides (COLMAP's `max_scale`)
 GRID = 129  # places along either side of a pinhole image at which it is checked against the photo
-SMALLEST_SHARE = 0.1
-"""A pinhole image that covers less of the photo's width or height is not one of a lens."""
+SMALLEST_SHARE = 0.1  # a pinhole image that covers less of the photo's width or height is not one of a lens
 EDGE = 0.5  # pixels by which the border of the pinhole image may leave the photo
 PANORAMA_REMEDY = "cut it into perspective photos and reconstruct these (pycolmap's example panorama_sfm.py does both)"
 
