@@ -89,7 +89,7 @@ def remove_photos(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (lambda folder: (folder / "sparse/0/points3D.bin").unlink(), r"has no points3D\.bin: bring back what is"),
+        (lambda folder: (folder / "sparse/0/images.bin").unlink(), "no images.bin: bring it back, or take cameras.bin"),
         (remove_photos, r"sparse/0 names 9 photos, of which 7 are missing in .*cup \(photo02.png, .*\): at least 3"),
         (link_photos, "photo00.png is a link to /gone/photo00.png, which"),
         (link_folder, "images is a link to /gone, which is not there: copy that here"),
@@ -121,7 +121,8 @@ def test_photos_of_a_capture_name_the_capture(tmp_path, monkeypatch):
     folder = write_capture(tmp_path / "far/from/others/cup")
     photos = folder / "images"
     monkeypatch.chdir(photos)
-    for given in (photos, Path()):
+    assert_refused(f"is no capture, but has 1 in it: give {folder}$", load_scene, folder.parent)
+    for given in (photos, Path(), folder / "sparse", folder / "sparse/0"):
         assert not holds_photos_alone(given)
         assert_refused(f"{re.escape(str(given))} lies in the capture {folder}: give that folder", load_scene, given)
 
@@ -130,6 +131,8 @@ def test_without_points_random_ones_are_drawn(tmp_path):
     scene, again = load_scene(write_capture(tmp_path / "cup", num_points=0)), load_scene(tmp_path / "cup")
     assert len(scene.points) == len(scene.point_colors) == 50_000 and scene.drawn_points
     assert scene.notes[0].endswith("9 images, 0 points") and torch.equal(scene.points, again.points)
+    (tmp_path / "cup/sparse/0/points3D.bin").unlink()
+    assert load_scene(tmp_path / "cup").notes[:2] == (f"{scene.notes[0]} (there is no points3D)", scene.notes[1])
     pycolmap.Reconstruction().write_binary(tmp_path / "cup/sparse/0")
     assert_refused("no images with a pose", load_scene, tmp_path / "cup")
 
@@ -238,8 +241,8 @@ def test_where_photos_were_taken_away_no_other_folder_stands_in(tmp_path, other,
         capture = read_colmap(folder, *find_model(folder))
         assert capture.photo_folder == folder / "images" and len(capture.names) == kept
         np.testing.assert_allclose(camera_centers(capture.viewmats)[:, 0], range(9 - kept, 9), atol=1e-9)
-        said = f"{9 - kept} of 9 images are left out, their photos do not exist: photo00.png"
-        assert capture.notes[1] == (said if kept == 8 else f"{said}, ...")
+        shown = ", ".join([*(f"photo0{view}.png" for view in range(5)), "..."] if kept == 3 else ["photo00.png"])
+        assert capture.notes[1] == f"{9 - kept} of 9 images are left out, their photos do not exist: {shown}"
     elif not other.startswith("images"):
         assert_refused("of which 9 are missing", load_scene, folder)
 

@@ -175,7 +175,7 @@ def test_one_camera_a_photo_upright_and_lying(tmp_path, kind):
         (["images/1.xmp"], "1.xmp is not read, .* of RealityScan"),
         (["1_initial/params/p_calibrated_camera_parameters.txt"], "p_.*.txt is not read, .* or Pix4D"),
         (["distorted/sparse/0/cameras.bin"], "cameras.bin is not read, .* of COLMAP: move its folder to sparse/0"),
-        ([], "has 3 photos and nothing that says where they were taken from: find the cameras by 'turbogs reconstruct"),
+        ([], "3 photos and nothing that .*: find the cameras, then use SCENE:  turbogs reconstruct .* SCENE$"),
     ],
 )
 def test_cameras_of_other_programs_are_named(tmp_path, files, words):

@@ -36,11 +36,9 @@ PRIOR = 0.006
 """Standard deviation of every parameter of a camera before any is learnt, in the units of `Pinholes.moved`: four to six
 pixels at the edge of a photo of 1200."""
 SMALLEST_VARIANCE = 1e-14  # smallest variance in the prior, so that it can be inverted
-POINT_DAMPING = 1e-4
-"""Damping of a point's normal equations, relative to their trace: a point stays in a direction that no photo tells."""
+POINT_DAMPING = 1e-4  # relative damping of a point's normal equations: it stays in a direction that no photo tells
 FEWEST_OBSERVATIONS = 30  # a photo with fewer keeps its camera: three a parameter
-FINEST = 0.02
-"""Pixels: errors below are not taken for noise of the features, however exact a reconstruction is."""
+FINEST = 0.02  # pixels: errors below are not taken for noise of the features, however exact a reconstruction is
 FARTHEST_MATCH = 0.02
 """Share of a photo's width: photos are others than the reconstructed ones where half of the points are farther from
 where photos show them."""
@@ -51,8 +49,7 @@ DERIVATIVES = (
 )
 """Derivatives of a pixel's x and y by parameters of `Pinholes.moved` but the principal point: (parameter, function of
 `_Adjustment.move_cameras`, sign), in units of the focal length, and from function 6 on of the depth."""
-UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
-"""Rows and columns of the entries of a symmetric 3x3 matrix that are computed."""
+UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # rows and columns of the entries of a symmetric 3x3 matrix
 
 
 class Pinholes(NamedTuple):

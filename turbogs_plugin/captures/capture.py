@@ -16,8 +16,7 @@ from turbogs_plugin.types.cameras import Observations
 
 FEWEST_PHOTOS = 3  # fewest photos of a capture
 LONGEST_NAME = 4096  # most letters of a photo's name
-LARGEST_PIXEL = 1e9
-"""Most pixels of a focal length or a principal point, and the reciprocal of the fewest: training uses float32."""
+LARGEST_PIXEL = 1e9  # most pixels of focal lengths and principal points, and 1 by the fewest: for float32
 
 
 @dataclass

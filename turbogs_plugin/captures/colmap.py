@@ -79,6 +79,7 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     mixed = any(not (folder / f"{file}{suffix}").is_file() for file in FILES[:2])
     kind = "binary and text" if mixed else "binary" if suffix == ".bin" else "text"
     cloud = folder / CLOUD if len(model.points) and model.points["id"][0] >= colmap_files.FIRST_OF_CLOUD else None
+    of_points = f" of {CLOUD}" if cloud else "" if any(folder.glob(f"{FILES[2]}.*")) else f" (there is no {FILES[2]})"
     test, split = _own_split(scene, folder, found.names)
     beside = [other for other, _ in _models_in(folder.parent, FILES)]
     unused = named([other.name for other in beside if other != folder])
@@ -94,7 +95,7 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
         lenses=tuple(lens for _, lens in pairs),
         notes=(
             f"COLMAP reconstruction {folder} ({kind}): {len(images)} images, {len(model.points):,} points"
-            f"{f' of {CLOUD}' if cloud else ''}{where}{split}",
+            f"{of_points}{where}{split}",
             *([choice] if folder in beside and unused else []),
             *found.notes,
             *clouds_beside([folder, scene], cloud, f"{CLOUD} is, in a model without points3D"),

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 FILES, SUFFIXES = ("cameras", "images", "points3D"), (".bin", ".txt")
-CLOUD = "points3D.ply"
-"""A cloud that stands for the points where a model has none of COLMAP's (InstantSplat)."""
+CLOUD = "points3D.ply"  # a cloud that stands for the points where a model has none of COLMAP's (InstantSplat)
 FIRST_OF_CLOUD = np.uint64(2**63)  # first identifier of its points, which no feature names
 FEATURE = np.dtype([("pixel", "<f8", 2), ("point", "<u8")])
 """A place in an image, and the identifier of the point that it shows, or `NO_POINT`."""
@@ -35,8 +34,7 @@ POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3)])
 NO_POINT = np.uint64(2**64 - 1)
 SENSORS = {"CAMERA": 0, "IMU": 1}  # kinds of sensors of a rig
 NUMBER = re.compile(r"[-+.\de]+|[-+]?(nan|inf)", re.IGNORECASE)
-NAME = re.compile(r"\s*(?:\S+\s+){8}\S+[ \t](.+)")
-"""The line of an image in text: nine numbers and its name."""
+NAME = re.compile(r"\s*(?:\S+\s+){8}\S+[ \t](.+)")  # the line of an image in text: nine numbers and its name
 
 
 @dataclass
@@ -65,10 +63,12 @@ def read_model(folder: Path, suffix: str) -> ColmapModel:
     given = {file: [folder / f"{file}{end}" for end in (suffix, *SUFFIXES)] for file in FILES}
     cameras, images, points = (next(filter(Path.is_file, paths), paths[0]) for paths in given.values())
     points = points if points.is_file() or not (folder / CLOUD).is_file() else folder / CLOUD
-    if absent := [path.name for path in (cameras, images, points) if not path.is_file()]:
-        remedy = "bring back what is missing, or take that folder away and find the cameras by 'turbogs reconstruct'"
-        raise InputError(f"{folder} has no {' and no '.join(absent)}: {remedy}")
-    known_cameras, known_points = _read_cameras(cameras), _read_points(points)
+    for absent, other in ((cameras, images), (images, cameras)):
+        if not absent.is_file():
+            remedy = f"bring it back, or take {other.name} away and find the cameras by 'turbogs reconstruct'"
+            raise InputError(f"{folder} has no {absent.name}: {remedy}")
+    known_cameras = _read_cameras(cameras)
+    known_points = _read_points(points) if points.is_file() else np.zeros(0, POINT)
     known_images: dict[int, ModelImage] = {}
     for record in _records(images):
         number, *pose, camera = record.take("I7dI")

@@ -19,10 +19,8 @@ from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.host_arrays import host_array
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 
-SMALLEST_SIDE = 4
-"""The shorter side of a reduced photo has at least this many pixels; of fewer, nothing is left to see."""
-OPAQUE_SUFFIXES = (".jpg", ".jpeg")
-"""Suffixes of formats without alpha, whose headers need not be read again."""
+SMALLEST_SIDE = 4  # the shorter side of a reduced photo has at least this many pixels; of fewer, nothing is left to see
+OPAQUE_SUFFIXES = (".jpg", ".jpeg")  # suffixes of formats without alpha, whose headers need not be read again
 CONVERT = "convert it to JPEG"
 KINDS = (
     (rb".{4}ftyp(hei|hev|mif1|msf1)", "HEIC", CONVERT),
@@ -38,14 +36,12 @@ KINDS = (
 """What files under the names of photos may be that Pillow does not read: their first bytes, and what to do."""
 FORMATS = ("JPEG", "PNG", "TIFF", "BMP")
 """Formats of images, told by content. Pillow would try dozens, PostScript among them, for which it starts a program."""
-OTHER_FORMATS = {".webp": "WEBP", ".avif": "AVIF", ".jp2": "JPEG2000"}
-"""Suffix -> the format that files of it may have besides."""
+OTHER_FORMATS = {".webp": "WEBP", ".avif": "AVIF", ".jp2": "JPEG2000"}  # suffix -> format that it may have
 PIXELS_A_BYTE, ALWAYS_PIXELS = 96, 1 << 25
 """Most pixels of an image for each byte of its file, and pixels that any file may have: files of a few kilobytes can
 unpack to gigabytes. A photo has 1 to 20 pixels a byte, an even grey one of JPEG 64."""
 MOST_SCANS = 200  # of a progressive JPEG, each of which goes over all pixels; programs write about ten
-MOST_THREADS = 16
-"""Photos that are decoded at a time; undistorted and reduced, each takes up to 24 bytes a pixel."""
+MOST_THREADS = 16  # photos that are decoded at a time; undistorted and reduced, each takes up to 24 bytes a pixel
 
 
 def reduced_sizes(sizes: np.ndarray, factor: float) -> np.ndarray:

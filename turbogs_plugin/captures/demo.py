@@ -23,17 +23,14 @@ from turbogs_plugin.scene.geometry import look_at
 if TYPE_CHECKING:
     import pycolmap
 
-Texture = Callable[[np.ndarray], np.ndarray]
-"""[R, 3] points in the solid's own coordinates -> [R, 3] colours, 0 .. 1."""
-RAYS_PER_SIDE = 3
-"""Each pixel is the mean of this many rays squared. Odd, so that one goes through its centre."""
+Texture = Callable[[np.ndarray], np.ndarray]  # [R, 3] points in the solid's own coordinates -> [R, 3] colours
+RAYS_PER_SIDE = 3  # each pixel is the mean of this many rays squared; odd, so that one goes through its centre
 LIGHT = np.array([0.45, -0.25, 0.86], dtype=np.float32)
 AMBIENT = 0.55
 ORBIT_RADIUS, ORBIT_HEIGHT, ORBIT_SWING = 3.6, 1.9, 0.5
 LOOK_AT = 0.25  # height of what the cameras look at, above the middle of the table
 FOCAL = 1.15  # focal length in image widths: 47 degrees across
-POINT_NOISE = 0.004
-"""Standard deviation of the noise on the reconstruction's points; solids are about 1 across."""
+POINT_NOISE = 0.004  # standard deviation of the noise on the reconstruction's points; solids are about 1 across
 POINTS_PER_VIEW = 150
 PHOTO_NAME = "view_{:03d}.png"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 from collections.abc import Callable
@@ -15,7 +16,7 @@ import torch
 
 from turbogs_plugin.captures import transforms
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture
-from turbogs_plugin.captures.colmap import find_model, read_colmap
+from turbogs_plugin.captures.colmap import MODEL_FOLDERS, find_model, read_colmap
 from turbogs_plugin.captures.decoding import ALWAYS_PIXELS, channels_of, load_photos, photo_sizes, reduced_sizes
 from turbogs_plugin.captures.mask_files import find_masks, load_masks
 from turbogs_plugin.captures.photo_files import IMAGES, find_photos, unread
@@ -53,12 +54,9 @@ OTHER_POSES = {
 """Files that may have cameras and are not read, by what writes them and the way from there to a capture."""
 SPLITS = ("test.txt", "train.txt", "val.txt", "split.json", "train_test_lists.json", "transforms_test.json")
 """Files of splits, of which readers of other kinds of captures take none."""
-PARTS_OF_RUN = ("model.ply", "checkpoints", "report")
-"""One of these lies beside the config.yaml of a run that has begun."""
-LENS_PIXELS = 16
-"""Pixels of a lens's camera for each of the photo that is undistorted in the camera's size, at most."""
-FARTHEST = 1e15
-"""Distance of a point in extents, from which on squares, and squares of these, do not fit into float32."""
+PARTS_OF_RUN = ("model.ply", "checkpoints", "report")  # one lies beside the config.yaml of a run that has begun
+LENS_PIXELS = 16  # pixels of a lens's camera for each of the photo that is undistorted in the camera's size, at most
+FARTHEST = 1e15  # distance of a point in extents, from which on squares, and squares of these, do not fit into float32
 
 
 def load_scene(
@@ -254,7 +252,10 @@ def read_capture(scene: Path) -> Capture:
         unused = ", ".join([*(name for name, _ in kinds[place + 1 :]), *splits])
         notes = [*([f"{unused} not used"] if unused else []), *(f"not used: {error}" for error in failed)]
         return replace(capture, notes=(*capture.notes, *notes))
-    raise failed[0] if failed else _no_capture(scene)
+    if not failed:
+        raise _no_capture(scene)
+    where = "" if find_photos(scene)[1] else _elsewhere(scene)
+    raise InputError(where) if where else failed[0]
 
 
 def _kinds(scene: Path) -> list[tuple[str, Callable[[], Capture]]]:
@@ -266,7 +267,10 @@ def _kinds(scene: Path) -> list[tuple[str, Callable[[], Capture]]]:
 
 def holds_photos_alone(scene: Path) -> bool:
     """True where a folder has photos and nothing that says where they were taken from, neither in it nor around it."""
-    return scene.is_dir() and not _kinds(scene) and bool(find_photos(scene)[1]) and not _elsewhere(scene)
+    if not scene.is_dir() or _kinds(scene) or _elsewhere(scene):
+        return False
+    inner = set(_captures_in(scene))
+    return any(inner.isdisjoint(photo.parents) for photo in find_photos(scene)[1])
 
 
 def run_folder(folder: Path) -> str:
@@ -278,8 +282,17 @@ def run_folder(folder: Path) -> str:
 
 def _elsewhere(folder: Path) -> str:
     """A line where a folder is a run's, or lies in a capture; empty where it is and does neither."""
-    around = folder.absolute().parent
-    return run_folder(folder) or (f"{folder} lies in the capture {around}: give that folder" if _kinds(around) else "")
+    at = folder.absolute()
+    tops = [top for top in at.parents[:3] for name in MODEL_FOLDERS[:-1] if top / name in (at, at.parent)]
+    around = (tops or [at.parent])[-1]  # of the folder of a model or of photos
+    known = _kinds(around) and (find_photos(around)[1] or not _kinds(folder))
+    return run_folder(folder) or (f"{folder} lies in the capture {around}: give that folder" if known else "")
+
+
+def _captures_in(folder: Path) -> list[Path]:
+    """Captures with their photos that lie in a folder."""
+    inner = (place for place in sorted(folder.glob("[!.]*")) if place.is_dir() and os.access(place, os.R_OK | os.X_OK))
+    return [place for place in inner if _kinds(place) and find_photos(place)[1]]
 
 
 def other_poses(folder: Path) -> str:
@@ -295,10 +308,12 @@ def _no_capture(scene: Path) -> InputError:
     """The error for a folder that is no capture: what it lacks."""
     if where := _elsewhere(scene):
         return InputError(where)
-    poses, call = other_poses(scene), f"'turbogs reconstruct {shlex.quote(str(scene))} --out SCENE'"
+    if inner := _captures_in(scene):
+        return InputError(f"{scene} is no capture, but has {len(inner)} in it: give {' or '.join(map(str, inner[:3]))}")
+    poses, call = other_poses(scene), f"turbogs reconstruct {shlex.quote(str(scene))} --out SCENE"
     if photos := find_photos(scene)[1]:
         known = f"{poses}; or" if poses else "nothing that says where they were taken from:"
-        return InputError(f"{scene} has {len(photos)} photos and {known} find the cameras by {call}, then use SCENE")
+        return InputError(f"{scene} has {len(photos)} photos and {known} find the cameras, then use SCENE:  {call}")
     return InputError(
         f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
         f"{', a '.join(READERS)}, nor photos; "

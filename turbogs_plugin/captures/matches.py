@@ -7,15 +7,13 @@ import numpy as np
 from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.scene.scene import PosedImages
 
-LONG_SIDE, FEATURES = 640, 800
-"""Pixels of a photo's longer side to which it is reduced, and its features, at most."""
+LONG_SIDE, FEATURES = 640, 800  # pixels of a photo's longer side to which it is reduced, and its features, at most
 RATIO = 0.8  # of the distances of the nearest and the second descriptor, at most (Lowe, 2004)
 EPIPOLAR_SHARE = 3e-3
 """A match agrees with two cameras that are nearer to its epipolar line than this share of the photos' longer side."""
 STILL = 2e-3  # by which a match moves at least, at a focal length of 1: what stands still is a mark, or the ground
 
-Pair = tuple[int, int, np.ndarray, np.ndarray]
-"""Two photos, and [N, 3] rays (z = 1) of their matches in each."""
+Pair = tuple[int, int, np.ndarray, np.ndarray]  # two photos, and [N, 3] rays (z = 1) of their matches in each
 
 
 def matches(views: PosedImages, one: int, other: int) -> Pair:

@@ -14,8 +14,7 @@ from typing import NamedTuple
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, named, require_printable
 from turbogs_plugin.errors import InputError
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
-"""Suffixes of photos that both pillow and COLMAP read."""
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")  # of photos that both pillow and COLMAP read
 OTHER_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2")
 """Suffixes of photos that at least one of them does not read, and that may stand for others (`_stem`)."""
 NAMED_SUFFIXES = (*PHOTO_SUFFIXES, ".webp", ".avif", ".jp2")
@@ -29,10 +28,8 @@ UNREAD = {
     "it is a video: take photos out of it, as by  ffmpeg -i VIDEO -vf fps=2 -q:v 2 PHOTOS/%05d.jpg": VIDEOS,
 }
 """Suffixes of files that are not read, by what to do with them."""
-MASKS = "(.*[_. -])?(mask|matte|segmentation)s?(_images)?"
-"""Names of folders of masks, in any letters; one of them is read (`mask_files.FOLDER`)."""
-MASK_OF_NAME = ".mask.png"
-"""RealityScan's masks are ``NAME.EXTENSION.mask.png``, beside the photos, too."""
+MASKS = "(.*[_. -])?(mask|matte|segmentation)s?(_images)?"  # names of masks' folders; one is read (`mask_files.FOLDER`)
+MASK_OF_NAME = ".mask.png"  # RealityScan's masks are ``NAME.EXTENSION.mask.png``, beside the photos, too
 _MAPS = "(?:mask|matte|depth|disparity|normal|albedo|semantic|seg|segmentation|instance|label|conf|confidence)s?"
 _MAPS += "(?:[_-]?(?:map|image|vi[sz])s?)?"
 NO_PHOTOS = re.compile(rf"\..*|images_\d+|(?:.*[_. -])?{_MAPS}(?:_\d+)?", re.IGNORECASE)
@@ -44,8 +41,7 @@ PHOTO_DEPTH = 1
 deeper, in the ``images`` of each."""
 FOLDER_DEPTH = 4  # named photos are looked for in folders of a capture, no deeper than this
 DEEPEST = 16  # folders of a name that are looked at, the last ones
-IMAGES, REDUCED = "images", tuple(f"images_{factor}" for factor in (2, 4, 8, 16))
-"""Folder of the photos, and of copies reduced by a factor."""
+IMAGES, REDUCED = "images", tuple(f"images_{factor}" for factor in (2, 4, 8, 16))  # of photos, and of reduced copies
 
 
 def find_photos(folder: Path) -> tuple[Path, list[Path]]:
@@ -180,10 +176,16 @@ def find_named(
     notes, ways = [], [(path, PureWindowsPath(names[place]).as_posix()) for place, path in moved.items()]
     if ways := [(path, name) for path, name in ways if str(PurePosixPath(path).with_suffix("")) != name]:
         path, name = ways[0]  # more than the suffix is another
-        notes.append(f"{len(ways)} photos are not where {source.name} says: {path} is taken for {name}, ...")
+        says = source.name if source == scene else source.relative_to(scene).as_posix()
+        notes.append(f"{len(ways)} photos are not where {says} says: {path} is taken for {name}, ...")
     if absent:
-        gone = f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {named(absent, most=1)}"
-        notes.append("; ".join(filter(None, (gone, link))))
+        gone = f"{len(absent)} of {len(names)} images are left out, their photos do not exist: {named(absent, most=5)}"
+        around = set().union(*said.values())
+        near = {scene / file for files in index.values() for file in files if file.parent in around}
+        taken = {scene / path for path, _ in pairs}
+        free = [path.relative_to(scene).as_posix() for path in sorted(near - taken - {*maps_beside(near | taken)})]
+        unused = f"{len(free)} photo{'s are' if free[1:] else ' is'} not used: {named(free, most=5)}" if free else ""
+        notes.append("; ".join(filter(None, (gone, link, unused))))
     inner = {path.split("/")[0] if "/" in path else "" for path, _ in pairs}
     folder = scene / inner.pop() if len(inner) == 1 else scene
     shown = tuple((scene / path).relative_to(folder).as_posix() for path, _ in pairs)

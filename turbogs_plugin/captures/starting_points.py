@@ -21,10 +21,8 @@ NUM_RANDOM_POINTS = 50_000
 GREY = 128  # colour of points without one
 MODEL_PROPERTIES = {"opacity", "f_dc_0", "scale_0", "rot_0", "packed_position"}
 """Properties of a .ply of which a model has at least one, and a cloud of points none."""
-LOOKING = 0.9
-"""Share of the views that must have one point in their images to be taken for views of one thing."""
-LEAST_SPACING = 1e-2
-"""Cameras nearer to each other than this share of their extent are taken to be in one place."""
+LOOKING = 0.9  # share of the views that must have one point in their images to be taken for views of one thing
+LEAST_SPACING = 1e-2  # cameras nearer to each other than this share of their extent are taken to be in one place
 COLOR_VIEWS = 32  # photos that give random points their colours, at most
 
 

@@ -34,14 +34,12 @@ TEST_FRAMES = "test_frames"  # frames to test on, which are not among the others
 BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
 """Names of one model, whose missing coefficients are 0."""
 FISHEYE = "OPENCV_FISHEYE"
-BENDS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-"""Coefficients of distortion, in the order of COLMAP's FULL_OPENCV."""
+BENDS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of distortion, as COLMAP's FULL_OPENCV has them
 FOR_ALL = {*("camera_model", "is_fisheye", "w", "h", *BENDS, "mask_path"),
            *("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")}  # fmt: skip
 """Keys of a file that hold for each frame without a value of its own."""
 
-Frame = dict[str, Any]
-"""A frame of a file, with what stands there for all frames."""
+Frame = dict[str, Any]  # a frame of a file, with what stands there for all frames
 
 
 def read_transforms(scene: Path) -> Capture:

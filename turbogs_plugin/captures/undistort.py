@@ -15,21 +15,18 @@ import numpy as np
 from PIL import Image
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.agreement import off_middle
 
 if TYPE_CHECKING:
     import pycolmap
 
-LARGEST_SIDE = 65535
-"""Photos wider or higher than this many pixels are refused (it is JPEG's own limit)."""
+LARGEST_SIDE = 65535  # most pixels of a photo's width or height: JPEG's own limit
 STRAIGHT_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 """COLMAP's camera models that are a pinhole where all their parameters of distortion, if any, are 0."""
-WIDEST = math.tan(math.radians(60.0))
-"""Tangent of the largest angle off the axis in the pinhole image: a fisheye's rim would become a smear."""
-LARGEST_GROWTH = 2.0
-"""The pinhole image has at most this many times the sides of the photo (COLMAP's `max_scale`)."""
+WIDEST = math.tan(math.radians(60.0))  # of the largest angle off the axis: a fisheye's rim would become a smear
+LARGEST_GROWTH = 2.0  # most that the pinhole image has of the photo's sides (COLMAP's `max_scale`)
 GRID = 129  # places along either side of a pinhole image at which it is checked against the photo
-SMALLEST_SHARE = 0.1
-"""A pinhole image that covers less of the photo's width or height is not one of a lens."""
+SMALLEST_SHARE = 0.1  # a pinhole image that covers less of the photo's width or height is not one of a lens
 EDGE = 0.5  # pixels by which the border of the pinhole image may leave the photo
 PANORAMA_REMEDY = "cut it into perspective photos and reconstruct these (pycolmap's example panorama_sfm.py does both)"
 
@@ -71,7 +68,7 @@ class Lens:
 def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
     """The lens of a camera of any of COLMAP's models; None for a pinhole, and for an impossible size, which
     `Capture.checked` refuses. Raises `InputError` for a panorama, which no pinhole camera can show, and for parameters
-    that are not those of a lens within the photo; `owner` names the camera."""
+    that are not those of a lens within the photo, or of another size; `owner` names the camera."""
     model, size = camera.model.name, (camera.width, camera.height)
     bent = model not in STRAIGHT_MODELS or camera.params[list(camera.extra_params_idxs())].any()
     if not bent or max(size) > LARGEST_SIDE:
@@ -80,8 +77,9 @@ def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
         raise InputError(f"{owner} is {model}, a panorama: {PANORAMA_REMEDY}")
     if (lens := _lens(model, size, tuple(camera.params.tolist()))) is None:
         trouble = "with parameters that are not those of a lens, or whose image folds within the photo"
-        remedy = "reconstruct the capture again, with the model OPENCV_FISHEYE for a wide lens"
-        raise InputError(f"{owner} is {model} {trouble}: {remedy}")
+        trouble += ": reconstruct the capture again, with the model OPENCV_FISHEYE for a wide lens"
+        other_size = off_middle(camera.params[list(camera.principal_point_idxs())] / size)
+        raise InputError(f"{owner}: {other_size}" if other_size else f"{owner} is {model} {trouble}")
     return lens
 
 

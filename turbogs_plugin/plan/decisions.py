@@ -100,10 +100,10 @@ def wanted_backdrop(facts: SceneFacts, config: Config) -> Verdict:
     if 0 < cap <= BACKDROP_COUNT:
         return False, f"its {BACKDROP_COUNT} Gaussians leave no room within density.max_gaussians {cap}"
     far_away = facts.far_points >= FAR_POINTS
-    return one_sided or far_away, (
-        f"view directions concentrated to {facts.direction_concentration:.3f} {_sign(one_sided)} {ONE_SIDED}, "
-        f"one point in 100 lies {facts.far_points:.1f} scene sizes away {_sign(far_away)} {FAR_POINTS:g}"
-    )
+    why = f"view directions concentrated to {facts.direction_concentration:.3f} {_sign(one_sided)} {ONE_SIDED}"
+    if facts.far_points:  # 0: points are random
+        why += f", one point in 100 lies {facts.far_points:.1f} scene sizes away {_sign(far_away)} {FAR_POINTS:g}"
+    return one_sided or far_away, why
 
 
 def wanted_exposure(facts: SceneFacts, config: Config) -> Verdict:

@@ -40,16 +40,22 @@ def require_agreement(scene: Scene) -> None:
         raise InputError(f"'{scene.name}': {cause}; scene.force=true trains all the same")
 
 
+def off_middle(principal: np.ndarray) -> str:
+    """The cause and the remedy where principal points [2], in shares of width and height, are of another size."""
+    if not ((principal < LEAST_MIDDLE).all() or (principal > MOST_MIDDLE).all()):
+        return ""
+    place = f"principal points are at {principal[0]:.2g}, {principal[1]:.2g} of the photos' width and height"
+    return f"{place}, not near .5: write the photos' size (w, h), and pixels of it from the upper left corner"
+
+
 def _contradiction(scene: Scene) -> str:
     """The cause and the remedy of `require_agreement`; empty where nothing contradicts."""
     views = scene.train
     lens = float(np.median(views.cameras.Ks[:, 0, 0].cpu().numpy() / views.cameras.sizes[:, 0]))
     if lens < SHORTEST_LENS:
         return f"focal lengths are {lens:.2g} of the photos' width: write intrinsics in pixels, not in shares of it"
-    x, y = middle = np.median(views.cameras.Ks[:, :2, 2].cpu().numpy() / views.cameras.sizes, axis=0)
-    if (middle < LEAST_MIDDLE).all() or (middle > MOST_MIDDLE).all():
-        place = f"principal points are at {x:.2g}, {y:.2g} of the photos' width and height"
-        return f"{place}, not near .5: write the photos' size (w, h), and pixels of it from the upper left corner"
+    if cause := off_middle(np.median(views.cameras.Ks[:, :2, 2].cpu().numpy() / views.cameras.sizes, axis=0)):
+        return cause
     pixels = [_pixels(views, view_id) for view_id in evenly(len(views), MOST_PHOTOS)]
     if views.photos.transparent and not any(part[:, 3].any() for part in pixels):
         return "all photos are transparent everywhere (alpha 0): write them without alpha"
