@@ -13,6 +13,7 @@ from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.commands.options import GivenOptions
 from turbogs_plugin.engine.render import render_image
+from turbogs_plugin.errors import InputError
 from turbogs_plugin.export import renders
 from turbogs_plugin.export.camera_path import through_views
 from turbogs_plugin.export.model_export import EXPORTS, contributions, pruned
@@ -149,12 +150,16 @@ def test_a_film_that_cannot_be_made_is_refused(turbogs, finished, tmp_path, monk
     assert not list(tmp_path.iterdir())
 
 
-def test_a_film_has_the_background(model, scene, tmp_path):
+def test_a_film_has_the_background_and_all_of_its_frames_or_is_none(model, scene, tmp_path, monkeypatch):
     ffmpeg, look = pytest.importorskip("imageio_ffmpeg"), replace(model.own_look(), background=WHITE)
     empty = model.gaussians.map(lambda value: value[:0])
     renders.write_film(empty, look, through_views(scene.train.cameras, 3), tmp_path / "a.mp4", 60)
     _, frame, *_ = ffmpeg.read_frames(str(tmp_path / "a.mp4"))
     assert np.frombuffer(frame, dtype=np.uint8).min() > 250
+    monkeypatch.setattr(ffmpeg, "count_frames_and_secs", lambda file: (2, 0.1))  # as where a disk is full at the end
+    with pytest.raises(InputError, match=r"cannot be encoded \(2 of 3 frames are in it\): is its disk full"):
+        renders.write_film(empty, look, through_views(scene.train.cameras, 3), tmp_path / "b.mp4", 60)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
 
 
 @pytest.mark.parametrize("path", ["orbit", "views", "file"])

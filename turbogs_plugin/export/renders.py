@@ -137,6 +137,9 @@ def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path, 
                 for frame in range(len(cameras)):
                     image = render_image(gaussians, cameras, frame, **look.options)
                     writer.send(np.ascontiguousarray(to_uint8(image.colors)[:height, :width]))
+            if (found := imageio_ffmpeg.count_frames_and_secs(str(temporary))[0]) != len(cameras):
+                raise OSError(f"{found} of {len(cameras)} frames are in it")  # the encoder's end says nothing
             temporary.replace(video)
-        except OSError as error:  # of the pipe to the encoder
-            raise InputError(f"--out '{video}' cannot be encoded: {' '.join(str(error).split())[:200]}") from None
+        except (OSError, RuntimeError) as error:  # of the pipe to the encoder, and of what it wrote
+            reason = f"{error}.".splitlines()[0].rstrip(".: ")  # without ffmpeg's command and version
+            raise InputError(f"--out '{video}' cannot be encoded ({reason}): is its disk full?") from None
