@@ -28,7 +28,7 @@ def test_few_modules_stand_beside_the_packages():
 ROOT = Path(__file__).resolve().parents[1]
 
 BUDGETS = {
-    "turbogs_plugin": 22_510,
+    "turbogs_plugin": 22_500,
     "turbogs_plugin/{types,tiles,masks,error_maps}": 1_100,
     "turbogs_plugin/{errors,files,device,yaml_json}": 480,
     "turbogs_plugin/engine": 4_200,
@@ -48,7 +48,7 @@ BUDGETS = {
     "turbogs_plugin/{commands,cli,doctor,__main__}": 850,
     "strategies": 2_000,
     "csrc": 6_000,
-    "tests": 24_045,
+    "tests": 24_042,
     "docs": 915,
 }
 """Folder or modules -> the most lines of Python, and of CUDA in csrc.

@@ -77,9 +77,8 @@ def check_state(saved: dict[str, Any], present: dict[str, Tensor], owner: str = 
     for name, value in present.items():
         if name not in saved or saved[name].shape != value.shape:
             found = f"shape {tuple(saved[name].shape)}" if name in saved else "nothing"
-            raise InputError(
-                f"{owner} {name}: found {found}, expected shape {tuple(value.shape)}; is it of another model?"
-            )
+            expected = f"expected shape {tuple(value.shape)}; is it of another model?"
+            raise InputError(f"{owner} {name}: found {found}, {expected}")
 
 
 def check_moments_config(beta1: float, beta2: float, eps: float) -> None:

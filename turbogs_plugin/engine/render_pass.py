@@ -192,10 +192,8 @@ class RenderOptions:
         engine evaluates, or a lower one than asked for."""
         held = gaussians.sh_degree
         if held > MAX_SH_DEGREE:
-            raise InputError(
-                f"these Gaussians hold spherical harmonics of degree {held}: the largest that is rendered is "
-                f"{MAX_SH_DEGREE}, so leave the coefficients above it out"
-            )
+            remedy = f"the largest that is rendered is {MAX_SH_DEGREE}, so leave the coefficients above it out"
+            raise InputError(f"these Gaussians hold spherical harmonics of degree {held}: {remedy}")
         if self.sh_degree is not None and not 0 <= self.sh_degree <= held:
             raise InputError(f"sh_degree is {self.sh_degree}, but these Gaussians hold degrees 0 to {held}")
         return held if self.sh_degree is None else self.sh_degree

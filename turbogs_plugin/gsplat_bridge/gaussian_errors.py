@@ -68,10 +68,9 @@ def _error_sums(info: dict[str, Any], count: int) -> Tensor | None:
     if errors is None:
         return None
     if info.get("flatten_ids") is None:
-        raise InputError(
-            f"info has '{PREDICTION}' and '{GROUND_TRUTH}' but neither '{STATISTICS}' nor 'flatten_ids': put them in "
-            "before backward for sparse_rasterization; gsplat's rasterization leaves 'flatten_ids'"
-        )
+        remedy = "put them in before backward for sparse_rasterization; gsplat's rasterization leaves 'flatten_ids'"
+        trouble = f"info has '{PREDICTION}' and '{GROUND_TRUTH}' but neither '{STATISTICS}' nor 'flatten_ids'"
+        raise InputError(f"{trouble}: {remedy}")
     ones = torch.ones_like(errors)
     sums = zero_channel_sums(info, torch.stack([errors, ones, torch.zeros_like(ones)], dim=-1))[..., :2]
     if info["gaussian_ids"] is None:

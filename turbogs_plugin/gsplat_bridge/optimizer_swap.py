@@ -182,9 +182,8 @@ class MemberOptimizer(torch.optim.Optimizer):
         for moment in MOMENTS:
             if state[moment].shape != parameter.shape:
                 found, remedy = tuple(state[moment].shape), "rows were added or removed without the optimizer"
-                raise InputError(
-                    f"state '{moment}' of '{self.name}' has shape {found}, not {tuple(parameter.shape)}: {remedy}"
-                )
+                shapes = f"shape {found}, not {tuple(parameter.shape)}"
+                raise InputError(f"state '{moment}' of '{self.name}' has {shapes}: {remedy}")
         return state
 
 

@@ -60,10 +60,8 @@ def read_photos(folder: Path) -> list[PhotoFile]:
         raise InputError(where)
     place, paths = find_photos(folder)
     if len(paths) < FEWEST_PHOTOS:
-        raise InputError(
-            f"{place if paths else folder} has {len(paths)} photos{reason}: at least {FEWEST_PHOTOS} are needed, of "
-            "one scene from different places"
-        )
+        needed = f"at least {FEWEST_PHOTOS} are needed, of one scene from different places"
+        raise InputError(f"{place if paths else folder} has {len(paths)} photos{reason}: {needed}")
     names = [plain_name(path.relative_to(place)) for path in paths]
     for name in names:
         require_printable(name, place)

@@ -173,10 +173,9 @@ def _reconstruct(photos: Sequence[PhotoFile], out: Path, others: str) -> Solutio
             break
     if best is None or best.placed < max(FEWEST_PHOTOS, SMALLEST_SHARE * len(photos)):
         placed = best.placed if best else 0
-        raise InputError(
-            f"cameras were found for only {placed} of {len(photos)} photos: take sharp photos that overlap by two "
-            "thirds with their neighbours, of one scene, from different places, not by turning in one place"
-        )
+        remedy = "with their neighbours, of one scene, from different places, not by turning in one place"
+        found = f"cameras were found for only {placed} of {len(photos)} photos"
+        raise InputError(f"{found}: take sharp photos that overlap by two thirds {remedy}")
     model, ghosts = best.model, set(best.ghosts)
     for frame in {image.frame_id for image in model.images.values() if image.name in ghosts}:
         model.deregister_frame(frame)

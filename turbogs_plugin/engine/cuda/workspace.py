@@ -58,9 +58,8 @@ def round_capacity(intersections: float) -> int:
 def require_possible(intersections: int) -> None:
     """Raise `InputError` for a pass of more intersections than one can have: no memory would suffice."""
     if intersections > MAX_CAPACITY:
-        raise InputError(
-            f"a pass takes at most {MAX_CAPACITY} intersections of tiles and splats: take fewer views or tiles"
-        )
+        most = f"at most {MAX_CAPACITY} intersections of tiles and splats"
+        raise InputError(f"a pass takes {most}: take fewer views or tiles")
 
 
 @dataclass
