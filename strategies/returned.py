@@ -26,11 +26,11 @@ def require_samples(samples: PixelSamples, view_ids: Sequence[int], sizes: np.nd
         if not np.array_equal(found, wanted):
             said = f"returned samples with {what} {np.array(found).tolist()}, not {np.array(wanted).tolist()}"
             raise InputError(f"{type(sampler).__name__} {said}: give view_ids, and masks [K, H, W], to from_mask")
-    ids, weights, most = samples.pixel_ids, samples.weights, int(sizes.prod(axis=1).max())
+    ids, weights = samples.pixel_ids, samples.weights
     if weights is not None and weights.shape != ids.shape:
         raise InputError(f"{type(sampler).__name__} returned {len(weights)} weights for {len(ids)} slots")
-    if ids.device.type == "cpu" and len(ids) and int(ids.max()) >= most:  # a GPU would be waited for
-        raise InputError(f"{type(sampler).__name__} returned pixel {int(ids.max())} of views of at most {most} pixels")
+    if ids.device.type == "cpu" and len(ids) and (last := int(ids.max())) >= sizes.prod(axis=1).max():  # no GPU waits
+        raise InputError(f"{type(sampler).__name__} returned pixel {last} of views of sizes {sizes.tolist()}")
 
 
 def require_rows(update: RowUpdate, controller: DensityController, gaussians: Gaussians) -> None:

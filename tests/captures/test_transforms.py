@@ -297,7 +297,8 @@ def test_photos_in_another_folder_that_may_be_others_are_not_taken(tmp_path):
     (folder / "rgb/f2.png").unlink()
     assert len(load_scene(folder).train) == 7
     edit(folder, lambda content: content["frames"][1].update(file_path="other/f0.png"))
-    assert "2 of 9 images are left out, their photos do not exist: images/f0.png" in " ".join(load_scene(folder).notes)
+    gone = "images/f0.png, other/f0.png"
+    assert f"2 of 9 images are left out, their photos do not exist: {gone}" in load_scene(folder).notes
 
 
 def test_neighbours_with_another_suffix_that_are_no_photos(tmp_path):

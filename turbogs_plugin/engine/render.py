@@ -16,6 +16,7 @@ from turbogs_plugin.engine.render_pass import Rendered, RenderOptions
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import Cameras, Gaussians, PixelSamples
+from turbogs_plugin.types.gaussians import ROW_SHAPES
 
 
 def rasterize(gaussians: Gaussians, cameras: Cameras, samples: PixelSamples, **options: Any) -> Rendered:
@@ -38,9 +39,8 @@ def _require_model(gaussians: Gaussians, cameras: Cameras) -> None:
     count, kind = len(gaussians), gaussians.means.dtype
     if kind not in (torch.float32, torch.float64):
         raise InputError(f"means are of {kind}: give float32, by gaussians.map(torch.Tensor.float)")
-    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
     for name, value in gaussians.items():
-        shape = (count, *shapes.get(name, (*value.shape[1:2], 3)))
+        shape = (count, *ROW_SHAPES.get(name, (*value.shape[1:2], 3)))
         if tuple(value.shape) != shape or value.dtype != kind:
             raise InputError(f"{name} is {tuple(value.shape)} of {value.dtype}: expected {shape} of {kind}, as means")
     if (own := cameras.by_row()[0].dtype) != kind:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
+from turbogs_plugin.types.gaussians import ROW_SHAPES
 
 Parameters = dict[str, torch.nn.Parameter] | torch.nn.ParameterDict
 Optimizers = Mapping[str, torch.optim.Optimizer]
@@ -22,10 +23,6 @@ STATISTICS = "gaussian_stats"
 """Key under which `sparse_rasterization` leaves the pass's `GaussianStats`, once backward has run."""
 
 GEOMETRY = ("means", "quats", "scales", "opacities")
-
-ROWS: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
-"""Shape of a Gaussian's row of each parameter but shN, as gsplat has it. A dimension of 1 may be there or not, as in
-nerfstudio's splatfacto."""
 
 ROLES = {"features_dc": "sh0", "features_rest": "shN", "colors": "sh0"}
 """Names that hosts have for gsplat's: splatfacto's, and colours where there are no harmonics."""
@@ -74,7 +71,8 @@ def role_of(name: str, params: Mapping[str, Any] | Parameters) -> str:
 
 
 def host_gaussians(params: Mapping[str, Tensor] | Parameters, names: Iterable[str] = PARAMETER_NAMES) -> Gaussians:
-    """A host's parameters as `Gaussians`. The tensors share memory with the parameters and have no gradient.
+    """A host's parameters as `Gaussians`. The tensors share memory with the parameters and have no gradient. A size
+    of 1 may be there or not, as in nerfstudio's splatfacto.
 
     Args:
         params: name -> tensor.
@@ -89,7 +87,7 @@ def host_gaussians(params: Mapping[str, Tensor] | Parameters, names: Iterable[st
     values = dict.fromkeys(PARAMETER_NAMES, params["means"].new_zeros(count, 1, 3))
     for name in [name for name in PARAMETER_NAMES if name in params]:
         value = params[name].detach()
-        row = ROWS.get(name, (*value.shape[1:2], 3))
+        row = ROW_SHAPES.get(name, (*value.shape[1:2], 3))
         if value.shape[:1] != (count,) or [size for size in value.shape[1:] if size != 1] != [s for s in row if s != 1]:
             expected = f"[{', '.join(map(str, ('N', *row)))}] with N = {count} as in 'means'"
             raise InputError(f"parameter '{name}' has shape {tuple(value.shape)}: expected {expected}")

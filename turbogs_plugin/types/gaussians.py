@@ -10,6 +10,8 @@ from torch import Tensor
 
 PARAMETER_NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
+ROW_SHAPES: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
+"""Shape of a Gaussian's row of each parameter but shN, as gsplat has it."""
 SH_C0 = 0.28209479177387814
 """The harmonic of degree 0: colour = SH_C0 * sh0 + 0.5."""
 
