@@ -43,13 +43,7 @@ FARTHEST_MATCH = 0.02
 """Share of a photo's width: photos are others than the reconstructed ones where half of the points are farther from
 where photos show them."""
 PARAMETERS = 10
-DERIVATIVES = (
-    ((0, 4, -1), (1, 0, 1), (1, 3, 1), (2, 2, -1), (3, 6, 1), (5, 7, -1), (6, 1, 1)),
-    ((0, 0, -1), (0, 5, -1), (1, 4, 1), (2, 1, 1), (4, 6, 1), (5, 8, -1), (7, 2, 1)),
-)
-"""Derivatives of a pixel's x and y by parameters of `Pinholes.moved` but the principal point: (parameter, function of
-`_Adjustment.move_cameras`, sign), in units of the focal length, and from function 6 on of the depth."""
-UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # rows and columns of the entries of a symmetric 3x3 matrix
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # entries of a symmetric 3x3 matrix, (row, column)
 
 
 class Pinholes(NamedTuple):
@@ -74,7 +68,9 @@ class Pinholes(NamedTuple):
                 relative; principal point (2), in half widths.
             depths: [V], of what is before each camera.
         """
-        turns = _rotations(by[:, :3])
+        from scipy.spatial.transform import Rotation
+
+        turns = Rotation.from_rotvec(by[:, :3]).as_matrix()
         translations = np.einsum("vij,vj->vi", turns, self.translations) + by[:, 3:6] * depths[:, None]
         focal, centers = self.focal * (1.0 + by[:, 6:8]), self.centers + by[:, 8:] * self.half_widths[:, None]
         return Pinholes(turns @ self.rotations, translations, focal, centers, self.half_widths)
@@ -179,44 +175,42 @@ class _Adjustment:
         return sights, residuals, np.where((sights[2] > 0) & np.isfinite(errors), errors, math.inf)
 
     def _counted(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """x / z, y / z and 1 / z in the camera [3, O]; residuals [2, O]; Cauchy's weights [O], in units of the noise.
-        All are 0 where the error is infinite."""
+        """x / z, y / z and 1 / z in the camera [3, O]; roots of Cauchy's weights [O], in units of the noise; residuals
+        [2, O] times these. All are 0 where the error is infinite."""
         sights, residuals, errors = self._seen()
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
             np.divide(1.0, sights[2], out=sights[2])
-            weights = 1.0 / (self.scale**2 + errors * errors)
-        if (left_out := weights == 0).any():
+            roots = 1.0 / np.sqrt(self.scale**2 + errors * errors)
+        if (left_out := roots == 0).any():
             sights[:, left_out], residuals[:, left_out] = 0.0, 0.0
-        return sights, residuals, weights
+        residuals *= roots
+        return sights, roots, residuals
 
     def move_cameras(self) -> None:
-        """One step of every camera, by sums over its observations of products of nine functions of the point with each
-        other and with the residuals: 1, p, q, pp, pq, qq, 1 / z, p / z and q / z, where p is x / z and q is y / z."""
-        (p, q, near), residuals, weights = self._counted()
-        roots = np.sqrt(weights)
-        functions = np.stack([np.ones_like(p), p, q, p * p, p * q, q * q, near, near * p, near * q])
-        functions *= roots
-        residuals *= roots
-        products = np.array([functions[:, own] @ functions[:, own].T for own in self.own])  # [V, 9, 9]
-        slopes = np.array([functions[:, own] @ residuals[:, own].T for own in self.own])  # [V, 9, 2]
-        factors, prior = self._camera_factors(), np.linalg.inv(self.spread)
-        normals = (factors @ products[:, None] @ factors.swapaxes(2, 3)).sum(axis=1) + prior
-        told = self.counts >= FEWEST_OBSERVATIONS
-        self.doubts[told] = np.linalg.inv(normals[told])
-        right = np.einsum("vcai,vic->va", factors, slopes) - self.moves @ prior  # of the normal equations
-        steps = np.einsum("vab,vb->va", self.doubts, right)
+        """One step of every camera."""
+        sights, roots, residuals = self._counted()
+        normals, right = np.zeros_like(self.doubts), np.zeros_like(self.moves)  # of the normal equations
+        for view, own in enumerate(self.own):
+            for slopes, residual in zip(self._slopes(view, *sights[:, own]), residuals[:, own], strict=True):
+                slopes *= roots[own]
+                normals[view] += slopes @ slopes.T
+                right[view] += slopes @ residual
+        told, prior = self.counts >= FEWEST_OBSERVATIONS, np.linalg.inv(self.spread)
+        self.doubts[told] = np.linalg.inv(normals[told] + prior)
+        steps = np.einsum("vab,vb->va", self.doubts, right - self.moves @ prior)
         self.moves += steps
         self.cameras = self.cameras.moved(steps, self.depths)
 
-    def _camera_factors(self) -> np.ndarray:
-        """[V, 2, PARAMETERS, 9]: how x and y of a pixel change by each parameter of its camera, in factors of functions
-        of the point, listed at `move_cameras`."""
-        factors = np.zeros((len(self.depths), 2, PARAMETERS, 9))
-        for axis, (derivatives, focal) in enumerate(zip(DERIVATIVES, self.cameras.focal.T, strict=True)):
-            for parameter, function, sign in derivatives:
-                factors[:, axis, parameter, function] = sign * focal * (self.depths if function >= 6 else 1.0)
-            factors[:, axis, 8 + axis, 0] = self.cameras.half_widths
-        return factors
+    def _slopes(self, view: int, p: np.ndarray, q: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """[2, PARAMETERS, N]: how x and y of a pixel change by each parameter of its camera; of points at x / z, y / z
+        and 1 / z."""
+        near = near * self.depths[view]
+        across, down = slopes = np.zeros((2, PARAMETERS, len(p)))
+        across[0], across[1], across[2], across[3], across[5], across[6] = -p * q, 1.0 + p * p, -q, near, -p * near, p
+        down[0], down[1], down[2], down[4], down[5], down[7] = -1.0 - q * q, p * q, p, near, -q * near, q
+        slopes *= self.cameras.focal[view][:, None, None]
+        across[8] = down[9] = self.cameras.half_widths[view]
+        return slopes
 
     def learn_spread(self) -> None:
         """One step of expectation-maximisation of the prior."""
@@ -227,7 +221,16 @@ class _Adjustment:
 
     def move_points(self) -> None:
         """One step of every point that two photos show."""
-        count, entries = self.places.shape[1], self._point_entries()
+        sights, roots, residuals = self._counted()
+        # What each observation adds to its point's normal equations: six entries of a matrix, three of a vector.
+        entries, count = np.empty((9, len(roots))), self.places.shape[1]
+        for own, rotation, focal in zip(self.own, self.cameras.rotations, self.cameras.focal, strict=True):
+            scales = focal[:, None] * (sights[2, own] * roots[own])
+            sides, ahead = rotation[:2, :, None], rotation[2][:, None]
+            x, y = (sides - sights[:2, None, own] * ahead) * scales[:, None]  # [3, N]: how a pixel changes by the point
+            for row, (i, j) in enumerate(UPPER):
+                entries[row, own] = x[i] * x[j] + y[i] * y[j]
+            entries[6:, own] = x * residuals[0, own] + y * residuals[1, own]
         seen = np.bincount(self.point_ids, entries[0] + entries[3] + entries[5] > 0, count)
         sums = np.stack([np.bincount(self.point_ids, values, count) for values in entries])  # [9, M]
         traces = sums[0] + sums[3] + sums[5]
@@ -236,36 +239,10 @@ class _Adjustment:
             sums[[0, 3, 5]] += POINT_DAMPING
             self.places += np.where((seen >= 2) & (traces > 0), _solved(*sums), 0.0)
 
-    def _point_entries(self) -> np.ndarray:
-        """[9, O]: what each observation adds to its point's normal equations in the world: six entries of a symmetric
-        matrix and three of a vector."""
-        (p, q, near), (across, down), weights = self._counted()
-        weights *= near
-        across, down = across * weights, down * weights
-        weights *= near
-        functions = np.stack([weights, weights * p, weights * q, weights * p * p, weights * q * q, across, down,
-                              across * p, down * q])  # fmt: skip
-        for own, factors in zip(self.own, self._point_factors(), strict=True):
-            functions[:, own] = factors @ functions[:, own]
-        return functions
-
-    def _point_factors(self) -> np.ndarray:
-        """[V, 9, 9]: these entries in factors of functions of what a photo shows of the point, listed above."""
-        across, down, ahead = self.cameras.rotations.swapaxes(0, 1)  # [V, 3] each
-        (fx, fy), (i, j) = self.cameras.focal.T[:, :, None], UPPER
-        factors = np.zeros((len(fx), 9, 9))
-        factors[:, :6, 0] = fx**2 * across[:, i] * across[:, j] + fy**2 * down[:, i] * down[:, j]
-        for column, axis, focal in ((1, across, fx), (2, down, fy)):
-            factors[:, :6, column] = -(focal**2) * (axis[:, i] * ahead[:, j] + ahead[:, i] * axis[:, j])
-            factors[:, :6, column + 2] = focal**2 * ahead[:, i] * ahead[:, j]
-            factors[:, 6:, column + 4] = focal * axis
-            factors[:, 6:, column + 6] = -focal * ahead
-        return factors
-
     def agreeing_cameras(self) -> Pinholes:
         """The cameras; the given one where its photo agrees no better."""
         old, new = self.first_errors, self._seen()[2]
-        better = np.array([own.stop > own.start and np.median(new[own]) < np.median(old[own]) for own in self.own])
+        better = np.array([_median(new[own]) < _median(old[own]) for own in self.own])
         pairs = zip(self.cameras, self.given, strict=True)
         return Pinholes(*(np.where(better.reshape(-1, *[1] * (now.ndim - 1)), now, then) for now, then in pairs))
 
@@ -275,13 +252,6 @@ def _solved(a, b, c, d, e, f, x, y, z) -> np.ndarray:
     aa, ab, ac, bb, bc, cc = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
     determinant = a * aa + b * ab + c * ac
     return np.stack([aa * x + ab * y + ac * z, ab * x + bb * y + bc * z, ac * x + bc * y + cc * z]) / determinant
-
-
-def _rotations(vectors: np.ndarray) -> np.ndarray:
-    """[V, 3, 3] of rotation vectors [V, 3] (Rodrigues)."""
-    angles = np.linalg.norm(vectors, axis=1)[:, None, None]
-    cross = np.cross(np.eye(3), vectors[:, None])  # `cross @ a` is the cross product with `a`
-    return np.eye(3) + np.sinc(angles / np.pi) * cross + 0.5 * np.sinc(angles / (2 * np.pi)) ** 2 * (cross @ cross)
 
 
 class RefinedCameras(NamedTuple):
