@@ -63,11 +63,8 @@ def epipolar_distances(relative: np.ndarray, first: np.ndarray, second: np.ndarr
         relative: [4, 4], from the first camera to the second.
         first, second: [N, 3], the matches on the cameras' image planes, z = 1.
     """
-    rotation, translation = relative[:3, :3], relative[:3, 3]
-    length = np.linalg.norm(translation)
-    if length == 0:
+    if not relative[:3, 3].any():
         return np.zeros(len(first))
-    essential = np.cross(np.eye(3), translation / length).T @ rotation
-    lines, back = first @ essential.T, second @ essential
-    size = np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1))
-    return np.abs((second * lines).sum(axis=1)) / np.maximum(size, 1e-12)
+    pycolmap = load_pycolmap()
+    essential = pycolmap.essential_matrix_from_pose(pycolmap.Rigid3d(relative[:3]))
+    return np.sqrt(pycolmap.compute_squared_sampson_error(first[:, :2], second[:, :2], essential))
