@@ -11,7 +11,7 @@ from torch import Tensor
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks
-from turbogs_plugin.scene.geometry import camera_centers, evenly, mean_neighbor_distances
+from turbogs_plugin.scene.geometry import camera_centers, evenly, mean_neighbor_distances, seen
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 from turbogs_plugin.scene.ply import read_colors, read_vertices
 from turbogs_plugin.types import Cameras
@@ -115,22 +115,18 @@ def colors_in_photos(points: Tensor, cameras: Cameras, photos: Photos, masks: Pi
     Masked pixels (`masks`, on the CPU) do not count, and transparent ones by their alpha. Points that none sees get the
     mean of the others; grey where there is none.
     """
-    cameras, points = cameras.to("cpu", torch.float32), points.cpu()
+    places, viewmats, Ks = (tensor.cpu().float().numpy() for tensor in (points, cameras.viewmats, cameras.Ks))
     sums, counts = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
     for view in evenly(len(photos), COLOR_VIEWS):
-        viewmat, (width, height) = cameras.viewmats[view], photos.sizes[view].tolist()
-        in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-        depths = in_camera[:, 2]
-        x, y = ((in_camera @ cameras.Ks[view].T)[:, :2] / depths.clamp(min=1e-9)[:, None]).unbind(dim=1)
-        inside = ((depths > 1e-9) & (x >= 0) & (y >= 0) & (x < width) & (y < height)).nonzero()[:, 0]
-        pixels = y[inside].long().clamp(max=height - 1) * width + x[inside].long().clamp(max=width - 1)
+        rows, inside, _ = map(torch.from_numpy, seen(places, viewmats[view], Ks[view], photos.sizes[view]))
+        pixels = inside.long() @ torch.tensor([1, photos.sizes[view, 0]])
         start = int(pixel_offsets(photos.sizes)[view])
-        seen = photos.stored[(start + pixels).to(photos.stored.device)].cpu().float()
+        colors = photos.stored[(start + pixels).to(photos.stored.device)].cpu().float()
         if not photos.transparent:
-            seen = torch.nn.functional.pad(seen, (0, 1), value=255.0)
+            colors = torch.nn.functional.pad(colors, (0, 1), value=255.0)
         if masks is not None:
-            seen *= masks.image(view).reshape(-1)[pixels, None]
-        sums.index_add_(0, inside, seen[:, :3])  # which are multiplied by alpha already
-        counts.index_add_(0, inside, seen[:, 3:] / 255.0)
+            colors *= masks.image(view).reshape(-1)[pixels, None]
+        sums.index_add_(0, rows, colors[:, :3])  # which are multiplied by alpha already
+        counts.index_add_(0, rows, colors[:, 3:] / 255.0)
     others = sums.sum(dim=0) / counts.sum() if counts.any() else torch.full((3,), float(GREY))
     return torch.where(counts > 0, sums / counts.clamp(min=1e-9), others).round().to(torch.uint8)
