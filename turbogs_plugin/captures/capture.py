@@ -32,12 +32,12 @@ class Capture:
         sizes: [V, 2] int64 (width, height) of the full-size photos, undistorted where they have a lens.
         points: [M, 3] float64; M is 0 where `load_scene` is to draw them.
         point_colors: [M, 3] uint8; None: points are random, and their colours are the photos' (`colors_in_photos`).
-        lenses: one a view, None for a pinhole camera; given as empty where all are.
+        lenses: one a view, None for a pinhole camera.
+        mask_files: files of masks that the capture names, one a view or None.
         notes: what the capture was taken for, and what was done with it: lines for the user.
         test: [V] bool, the test views of the capture's own split; None: views are split by their order.
         alpha: what the alpha of a photo is: the object's ``opacity``, so that the background shows through and training
             makes the model as transparent; or a ``mask``, whose zero pixels are ignored.
-        mask_files: files of masks that the capture names, one a view or None; given as empty where it names none.
         observations: where photos show the points, in pixels as `Ks` has them; None: the capture does not say.
         doubt: what may be wrong with the poses.
     """
@@ -48,18 +48,14 @@ class Capture:
     Ks: np.ndarray
     sizes: np.ndarray
     points: np.ndarray
-    point_colors: np.ndarray | None = None
-    lenses: tuple[Lens | None, ...] = ()
-    notes: tuple[str, ...] = ()
-    test: np.ndarray | None = None
+    point_colors: np.ndarray | None
+    lenses: tuple[Lens | None, ...]
+    mask_files: tuple[Path | None, ...]
+    notes: tuple[str, ...]
+    test: np.ndarray | None
     alpha: Literal["opacity", "mask"] = "opacity"
-    mask_files: tuple[Path | None, ...] = ()
     observations: Observations | None = None
     doubt: str = ""
-
-    def __post_init__(self) -> None:
-        self.lenses = self.lenses or (None,) * len(self.names)
-        self.mask_files = self.mask_files or (None,) * len(self.names)
 
     @property
     def photo_sizes(self) -> np.ndarray:
@@ -105,9 +101,9 @@ class Capture:
         shown = self.observations
         if shown is not None:
             shown = shown.of_views(views, np.ones((len(views), 2)))
-            places = np.searchsorted(points, shown.point_ids).clip(max=len(points) - 1)
-            there = points[places] == shown.point_ids
-            shown = Observations(shown.pixels[there], shown.view_ids[there], places[there])
+            there = np.isin(shown.point_ids, points)
+            ids = np.searchsorted(points, shown.point_ids[there])
+            shown = Observations(shown.pixels[there], shown.view_ids[there], ids)
         per_view = ("names", "viewmats", "Ks", "sizes", "lenses", "test", "mask_files")
         kept: dict[str, Any] = {name: rows(name, views) for name in per_view}
         kept |= {name: rows(name, points) for name in ("points", "point_colors")}

@@ -93,6 +93,7 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
         points=model.points["xyz"].copy(),
         point_colors=model.points["color"].copy(),
         lenses=tuple(lens for _, lens in pairs),
+        mask_files=(None,) * len(images),
         notes=(
             f"COLMAP reconstruction {folder} ({kind}): {len(images)} images, {len(model.points):,} points"
             f"{of_points}{where}{split}",

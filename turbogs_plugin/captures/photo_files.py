@@ -7,7 +7,6 @@ import re
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from itertools import takewhile
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import NamedTuple
 
@@ -216,8 +215,7 @@ def _best(files: Sequence[PurePosixPath], name: str) -> str:
     """The one of these files that a name stands for; empty where it is not clear."""
     path = PureWindowsPath(name)
     files = [file for file in files if plain(file.name) == plain(path.name)] or list(files)
-    pairs = [list(zip(reversed(file.parts[:-1]), reversed(path.parts[:-1]), strict=False)) for file in files]
-    ends = [len(list(takewhile(lambda both: both[0] == both[1], each))) for each in pairs]
+    ends = [max(n for n in range(1, 1 + len(file.parts)) if file.parts[-n:-1] == path.parts[-n:-1]) for file in files]
     best = [file for file, end in zip(files, ends, strict=True) if end == max(ends)]
     return str(best[0]) if len(best) == 1 else ""
 
