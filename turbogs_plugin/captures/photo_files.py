@@ -99,23 +99,22 @@ def files_below(folder: Path, depth: int = FOLDER_DEPTH, masks: bool = False) ->
         yield from (at / file for file in sorted(files) if file[0] != "." and (Path(place) / file).is_file())
 
 
-def file_named(scene: Path, name: str, source: Path, folder: str = "") -> str | None:
-    """The path, relative to the scene, of a file that a capture names relative to a folder of it (`_forms`); None where
-    it is not there. Raises `InputError` for a name that cannot be printed."""
+def file_named(scene: Path, name: str, source: Path, folders: Sequence[str] = ("",)) -> str | None:
+    """The path, relative to the scene, of a file that a capture names relative to folders of it (`_forms`), the first
+    that has it; None where none has. Raises `InputError` for a name that cannot be printed."""
     require_printable(name, source)
-    return next((form for form in _forms(name, folder) if os.path.isfile(f"{scene}/{form}")), None)
+    return next((form for form in _forms(name, folders) if os.path.isfile(f"{scene}/{form}")), None)
 
 
-def _forms(name: str, folder: str) -> list[str]:
-    """The paths in a scene that a name may mean in a folder: the name there; of a path of the machine that wrote it,
+def _forms(name: str, folders: Sequence[str]) -> Iterator[str]:
+    """The paths in a scene that a name may mean in each folder: the name there; of a path of the machine that wrote it,
     absolute or with '..', each of its ends of `DEEPEST` parts and fewer, the longest first. Separators may be Windows'
     ones. A copy of ``images/a.png`` is ``images_2/a.png``."""
     path = PureWindowsPath(name)  # knows both kinds of separators, drives and roots
-    parts = path.parts[bool(path.anchor) or (folder in REDUCED and path.parts[:1] == (IMAGES,)) :]
-    parts = (folder, *parts[-DEEPEST:]) if folder else parts[-DEEPEST:]
-    first, elsewhere = bool(folder), path.anchor or ".." in parts
-    starts = range(first, len(parts) if elsewhere else min(first + 1, len(parts)))
-    return ["/".join((*parts[:first], *parts[start:])) for start in starts if ".." not in parts[start:]]
+    for folder in folders:
+        parts = path.parts[bool(path.anchor) or (folder in REDUCED and path.parts[:1] == (IMAGES,)) :][-DEEPEST:]
+        ends = [parts[start:] for start in range(len(parts) if path.anchor or ".." in parts else min(1, len(parts)))]
+        yield from ("/".join((folder, *end) if folder else end) for end in ends if ".." not in end)
 
 
 class FoundPhotos(NamedTuple):
@@ -148,32 +147,29 @@ def find_named(
         InputError: a name that cannot be printed, a photo that is named twice, or fewer than `FEWEST_PHOTOS` photos.
     """
 
-    def named_in(places: Sequence[str]) -> list[str | None]:
-        files = ((file_named(scene, name, source, place) for place in places) for name in names)
-        return [next(filter(None, of_name), None) for of_name in files]
-
-    places = (folders, *([folder] for folder in REDUCED if (scene / folder).is_dir()))
-    enough = (found for found in map(named_in, places) if len(found) - found.count(None) >= FEWEST_PHOTOS)
-    found = next(enough, None) or named_in(folders)
+    reduced = ([folder] for folder in REDUCED if (scene / folder).is_dir())
+    for places in (folders, *reduced, folders):
+        found = [file_named(scene, name, source, places) for name in names]
+        if len(found) - found.count(None) >= FEWEST_PHOTOS:
+            break
     written = [path or PureWindowsPath(name).as_posix() for path, name in zip(found, names, strict=True)]
     if twice := [path for path, times in Counter(written).items() if times > 1]:
         raise InputError(f"{source} names the photo {twice[0]} twice: take one out, or rename the photos")
     missing = [place for place, path in enumerate(found) if path is None]
     index = {} if not missing else _index(scene, {*written, *(PureWindowsPath(other).as_posix() for other in others)})
     alike = {place: index.get(_stem(names[place]), []) for place in missing}
-    said = {p: {PurePosixPath(form).parent for at in folders for form in _forms(names[p], at)} for p in missing}
+    said = {place: {PurePosixPath(form).parent for form in _forms(names[place], folders)} for place in missing}
     beside = {place: [file for file in files if file.parent in said[place]] for place, files in alike.items()}
     moved = _distinct(beside, names) or (_distinct(alike, names) if len(missing) == len(found) else {})
-    pairs = sorted((moved.get(place) or path or "", place) for place, path in enumerate(found))
-    pairs = [(path, place) for path, place in pairs if path]
+    pairs = sorted((path, place) for place, path in (*enumerate(found), *moved.items()) if path)
     absent = [written[place] for place in missing if place not in moved]
-    links = (broken_link(scene / form) for name in absent[:1] for place in folders for form in _forms(name, place))
+    links = (broken_link(scene / form) for name in absent[:1] for form in _forms(name, folders))
     link = next(filter(None, links), "")
     if absent and len(pairs) < FEWEST_PHOTOS:
         lacking = f"{len(absent)} are missing in {scene} ({named(absent)}): at least {FEWEST_PHOTOS} are needed"
         raise InputError(f"{source} names {len(names)} photos, of which {lacking}; {link or 'copy the photos there'}")
-    notes, ways = [], [(path, PureWindowsPath(names[place]).as_posix()) for place, path in moved.items()]
-    if ways := [(path, name) for path, name in ways if str(PurePosixPath(path).with_suffix("")) != name]:
+    notes = []
+    if ways := [(path, written[at]) for at, path in moved.items() if os.path.splitext(path)[0] != written[at]]:
         path, name = ways[0]  # more than the suffix is another
         says = source.name if source == scene else source.relative_to(scene).as_posix()
         notes.append(f"{len(ways)} photos are not where {says} says: {path} is taken for {name}, ...")
