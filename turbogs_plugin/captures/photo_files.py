@@ -146,7 +146,6 @@ def find_named(
     Raises:
         InputError: a name that cannot be printed, a photo that is named twice, or fewer than `FEWEST_PHOTOS` photos.
     """
-
     reduced = ([folder] for folder in REDUCED if (scene / folder).is_dir())
     for places in (folders, *reduced, folders):
         found = [file_named(scene, name, source, places) for name in names]

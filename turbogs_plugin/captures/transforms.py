@@ -7,7 +7,6 @@ NeRF-synthetic tells training and test photos apart by file; its photos are name
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
 from functools import partial
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -47,13 +46,13 @@ def read_transforms(scene: Path) -> Capture:
     `InputError` for a file that is not such JSON, lacks something or describes no lens; a photo that two frames name;
     lists that are no split; a cloud that is absent or damaged."""
     content, frames = _frames(source := scene / FILE)
-    train, test = _own_split(content, [_written(frame) for frame in frames], source)
+    train, test = _own_split(content, {_written(frame) for frame in frames}, source)
     used = [frame for frame in frames if _written(frame) in train | test]
     words = f", {len(frames) - len(used)} others not used" if len(used) < len(frames) else ""
     if content.get(TEST_FRAMES):
         tested = _frames(source, TEST_FRAMES)[1]
         used, test, words = [*used, *tested], {*test, *map(_written, tested)}, f"{words}, with {TEST_FRAMES}"
-    return _capture(scene, source, content, used, test, f"nerfstudio, instant-ngp{words}")
+    return _capture(source, content, used, test, f"nerfstudio, instant-ngp{words}")
 
 
 def read_blender(scene: Path) -> Capture:
@@ -63,7 +62,7 @@ def read_blender(scene: Path) -> Capture:
     test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
     tested, words = ([], "") if test_file is None else (_frames(test_file)[1], f", with {test_file.name}")
     test = {_written(frame) for frame in tested}
-    return _capture(scene, source, content, [*train, *tested], test, f"NeRF-synthetic{words}")
+    return _capture(source, content, [*train, *tested], test, f"NeRF-synthetic{words}")
 
 
 def read_frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -93,13 +92,11 @@ def _written(frame: Frame) -> str:
     return PureWindowsPath(frame["file_path"]).as_posix()
 
 
-def _capture(
-    scene: Path, source: Path, content: dict[str, Any], frames: list[Frame], test: Collection[str], words: str
-) -> Capture:
+def _capture(source: Path, content: dict[str, Any], frames: list[Frame], test: set[str], words: str) -> Capture:
     """The capture of some frames, in the order of their photos' names; damaged poses are left out (`Capture.checked`).
     `content` is the file's, whose ``ply_file_path`` has the points; `test` has written names of the test photos: where
     none of them exists, there is no own split; `words` are on the kind of capture."""
-    names, cloud = [_written(frame) for frame in frames], content.get("ply_file_path")
+    names, cloud, scene = [_written(frame) for frame in frames], content.get("ply_file_path"), source.parent
     others = {text for frame in frames for key, text in frame.items() if key != "file_path" and isinstance(text, str)}
     found = find_named(scene, [frame["file_path"] for frame in frames], source, ("", "images"), others)
     rows, damaged = [], []
@@ -110,7 +107,7 @@ def _capture(
         except InputError as error:
             pose = np.full((4, 4), np.nan)
             damaged.append(error)
-        mask = None if "mask_path" not in frame else _file(scene, frame["mask_path"], f"mask_path of {owner}", source)
+        mask = None if "mask_path" not in frame else _file(frame["mask_path"], f"mask_path of {owner}", source)
         rows.append((pose, *_read_camera(frame, found.folder / name, source), mask))
     viewmats, Ks, sizes, lenses, masks = zip(*rows, strict=True)
     axes = {"opengl": np.eye(4), "opencv": OTHER_AXES}.get(str(content.get("axes", "opengl")).lower())
@@ -118,7 +115,7 @@ def _capture(
         raise InputError(f'{source}: its axes are {str(content["axes"])[:40]!r}: write "opengl" or "opencv"')
     points, colors, file = np.empty((0, 3)), None, None
     if cloud is not None:
-        points, colors, grey = read_cloud(file := _file(scene, cloud, "ply_file_path", source))
+        points, colors, grey = read_cloud(file := _file(cloud, "ply_file_path", source))
         words += f", {len(points):,} points of {cloud}{grey}"
     tested = np.array([names[place] in test for place in found.places])
     if damaged and (np.isfinite(viewmats).all(axis=(1, 2)) & ~tested).sum() < FEWEST_PHOTOS:
@@ -144,13 +141,13 @@ def _capture(
     ).checked(source)
 
 
-def _own_split(content: dict[str, Any], written: list[str], source: Path) -> tuple[set[str], set[str]]:
+def _own_split(content: dict[str, Any], everything: set[str], source: Path) -> tuple[set[str], set[str]]:
     """Written names of the training and of the test photos, by the lists of a ``transforms.json``; no test photos
     without any list.
 
     Test photos are in ``test_filenames``; where that is absent or empty, in ``val_filenames``. Where both are, all
     photos that are not for training are tests. Without ``train_filenames``, what is in no other list trains."""
-    lists, everything = {key: content[key] for key in LISTS if content.get(key)}, set(written)
+    lists = {key: content[key] for key in LISTS if content.get(key)}
     if not lists:
         return everything, set()
     if all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists.values()):
@@ -164,12 +161,11 @@ def _own_split(content: dict[str, Any], written: list[str], source: Path) -> tup
     raise InputError(f"{source}: {', '.join(lists)} are no split: {remedy}")
 
 
-def _file(scene: Path, name: Any, what: str, source: Path) -> Path:
+def _file(name: Any, what: str, source: Path) -> Path:
     """A file that a transforms file names; `InputError` where it is not there."""
-    path = file_named(scene, name, source) if isinstance(name, str) else None
-    if path is None:
-        raise InputError(f"{source}: its {what}, {str(name)[:200]!r}, is not there: bring it back, or take it out")
-    return scene / path
+    if isinstance(name, str) and (path := file_named(source.parent, name, source)):
+        return source.parent / path
+    raise InputError(f"{source}: its {what}, {str(name)[:200]!r}, is not there: bring it back, or take it out")
 
 
 def number_of(values: dict, source: Path, key: str, default: float | None = None) -> float | None:
