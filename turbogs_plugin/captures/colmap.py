@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import re
-import signal
-import threading
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +14,7 @@ from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, named, text_
 from turbogs_plugin.captures.colmap_files import CLOUD, FILES, ColmapModel, ModelImage, read_model
 from turbogs_plugin.captures.photo_files import IMAGES, find_named
 from turbogs_plugin.captures.starting_points import clouds_beside
-from turbogs_plugin.captures.undistort import Lens, lens_of_camera
+from turbogs_plugin.captures.undistort import Lens, lens_of_camera, load_pycolmap
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types.cameras import Observations
 
@@ -27,16 +24,6 @@ if TYPE_CHECKING:
 MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap", "colmap_sparse", "colmap_text", ".")
 """Folders of a scene's reconstructions, in order of preference; or numbered folders in them."""
 TEST = "test.txt"
-
-
-def load_pycolmap() -> ModuleType:
-    """The module, loaded where it is used: other captures need neither its time nor its presence. SIGTERM keeps the
-    handler that Python knows of: pycolmap brings one that prints a trace of C++."""
-    import pycolmap
-
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
-    return pycolmap
 
 
 def find_model(scene: Path) -> tuple[Path, str] | None:
@@ -66,7 +53,6 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     """Read a reconstruction that `find_model` has found, without images whose photo does not exist (`find_named`).
     Raises `InputError` for files that are damaged or inconsistent, a camera that no pinhole can take the place of, or
     fewer than `FEWEST_PHOTOS` photos."""
-    load_pycolmap()
     model = read_model(folder, suffix)
     found = find_named(scene, [image.name for image in model.images], folder, (IMAGES, ""))
     images = [model.images[place] for place in found.places]

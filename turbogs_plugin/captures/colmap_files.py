@@ -18,6 +18,7 @@ import numpy as np
 
 from turbogs_plugin.captures.capture import bytes_of, text_of
 from turbogs_plugin.captures.starting_points import read_cloud
+from turbogs_plugin.captures.undistort import load_pycolmap
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.ply import read_colors
 
@@ -117,15 +118,12 @@ def _take_poses_of_frames(images: dict[int, ModelImage], rigs: Path, frames: Pat
 
 def _viewmat(pose: np.ndarray) -> np.ndarray:
     """[4, 4] float64 of a quaternion of any length and a translation [7]; NaN where they are none."""
-    import pycolmap
-
     if not np.isfinite(pose).all() or not 1e-6 < np.abs(pose[:4]).max() < 1e6:
         return np.full((4, 4), np.nan)
+    pycolmap = load_pycolmap()
     rotation = pycolmap.Rotation3d(np.roll(pose[:4], -1))
     rotation.normalize()
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation.matrix(), pose[4:]
-    return viewmat
+    return np.vstack([pycolmap.Rigid3d(rotation, pose[4:]).matrix(), np.eye(1, 4, 3)])
 
 
 def _damaged(path: Path, trouble: str) -> InputError:
@@ -160,9 +158,8 @@ class _Text:
             if code == "d":
                 return float(word)
             if code == "i" and word.isidentifier():
-                import pycolmap
-
-                return SENSORS[word] if word in SENSORS else int(pycolmap.CameraModelId.__members__[word.upper()])
+                models = load_pycolmap().CameraModelId.__members__
+                return SENSORS[word] if word in SENSORS else int(models[word.upper()])
             number = int(float(word))
             if number != float(word) or (code != "i" and not 0 <= number < 256 ** struct.calcsize(f"<{code}")):
                 raise ValueError
@@ -245,8 +242,7 @@ def _records(path: Path) -> Iterator[_Text] | Iterator[_Binary]:
 
 
 def _read_cameras(path: Path) -> dict[int, pycolmap.Camera]:
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     models = {int(model): name for name, model in pycolmap.CameraModelId.__members__.items() if int(model) >= 0}
     cameras = {}
     for record in _records(path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from turbogs_plugin.captures.colmap import load_pycolmap
+from turbogs_plugin.captures.undistort import load_pycolmap
 from turbogs_plugin.scene.scene import PosedImages
 
 LONG_SIDE, FEATURES = 640, 800  # pixels of a photo's longer side to which it is reduced, and its features, at most

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, text_of
-from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.captures.decoding import photo_size
 from turbogs_plugin.captures.photo_files import file_named, find_named
 from turbogs_plugin.captures.starting_points import clouds_beside, read_cloud
-from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens, lens_of_camera
+from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens, lens_of_camera, load_pycolmap
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.agreement import OTHER_AXES
 from turbogs_plugin.scene.geometry import viewmat_of_pose

@@ -6,9 +6,12 @@ COLMAP chooses the pinhole camera: as fine as the photo on its axis, its image t
 from __future__ import annotations
 
 import math
+import signal
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +32,16 @@ GRID = 129  # places along either side of a pinhole image at which it is checked
 SMALLEST_SHARE = 0.1  # a pinhole image that covers less of the photo's width or height is not one of a lens
 EDGE = 0.5  # pixels by which the border of the pinhole image may leave the photo
 PANORAMA_REMEDY = "cut it into perspective photos and reconstruct these (pycolmap's example panorama_sfm.py does both)"
+
+
+def load_pycolmap() -> ModuleType:
+    """The module, loaded where it is used: other captures need neither its time nor its presence. SIGTERM keeps the
+    handler that Python knows of: pycolmap brings one that prints a trace of C++."""
+    import pycolmap
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
+    return pycolmap
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +65,7 @@ class Lens:
 
     def undistort(self, photo: Image.Image) -> Image.Image:
         """The pinhole's image, of `size`. Photos of another size than `photo_size` get that first."""
-        import pycolmap
-
+        pycolmap = load_pycolmap()
         if photo.size != self.photo_size:
             photo = photo.resize(self.photo_size, Image.Resampling.BILINEAR)
         planes, made = np.asarray(photo).reshape(photo.height, photo.width, -1), []
@@ -86,8 +98,7 @@ def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
 @lru_cache(maxsize=64)
 def _lens(model: str, size: tuple[int, int], params: tuple[float, ...]) -> Lens | None:
     """The lens of a camera's numbers, which the cameras of many photos share; None where they are not those of one."""
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     if not np.isfinite(params).all():
         return None
     camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=params)
@@ -100,8 +111,7 @@ def _lens(model: str, size: tuple[int, int], params: tuple[float, ...]) -> Lens 
 
 
 def _options() -> pycolmap.UndistortCameraOptions:
-    import pycolmap
-
+    pycolmap = load_pycolmap()
     return pycolmap.UndistortCameraOptions(blank_pixels=0.0, max_scale=LARGEST_GROWTH, max_cam_point_norm=WIDEST)
 
 
