@@ -252,10 +252,22 @@ def read_capture(scene: Path) -> Capture:
         unused = ", ".join([*(name for name, _ in kinds[place + 1 :]), *splits])
         notes = [*([f"{unused} not used"] if unused else []), *(f"not used: {error}" for error in failed)]
         return replace(capture, notes=(*capture.notes, *notes))
-    if not failed:
-        raise _no_capture(scene)
-    where = "" if find_photos(scene)[1] else _elsewhere(scene)
-    raise InputError(where) if where else failed[0]
+    photos = find_photos(scene)[1]
+    if where := "" if failed and photos else _elsewhere(scene):
+        raise InputError(where)
+    if failed:
+        raise failed[0]
+    if inner := _captures_in(scene):
+        raise InputError(f"{scene} is no capture, but has {len(inner)} in it: give {' or '.join(map(str, inner[:3]))}")
+    poses, call = other_poses(scene), f"turbogs reconstruct {shlex.quote(str(scene))} --out SCENE"
+    if photos:
+        known = f"{poses}; or" if poses else "nothing that says where they were taken from:"
+        raise InputError(f"{scene} has {len(photos)} photos and {known} find the cameras, then use SCENE:  {call}")
+    raise InputError(
+        f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
+        f"{', a '.join(READERS)}, nor photos; "
+        + (poses or unread(scene, every=True) or "give the folder of a capture, or of photos")
+    )
 
 
 def _kinds(scene: Path) -> list[tuple[str, Callable[[], Capture]]]:
@@ -302,20 +314,3 @@ def other_poses(folder: Path) -> str:
             for file in (file for form in forms.split() for file in place.glob(at + form)):
                 return f"{file} is not read, which may have cameras of {source}"
     return ""
-
-
-def _no_capture(scene: Path) -> InputError:
-    """The error for a folder that is no capture: what it lacks."""
-    if where := _elsewhere(scene):
-        return InputError(where)
-    if inner := _captures_in(scene):
-        return InputError(f"{scene} is no capture, but has {len(inner)} in it: give {' or '.join(map(str, inner[:3]))}")
-    poses, call = other_poses(scene), f"turbogs reconstruct {shlex.quote(str(scene))} --out SCENE"
-    if photos := find_photos(scene)[1]:
-        known = f"{poses}; or" if poses else "nothing that says where they were taken from:"
-        return InputError(f"{scene} has {len(photos)} photos and {known} find the cameras, then use SCENE:  {call}")
-    return InputError(
-        f"{scene} has neither a COLMAP reconstruction (cameras, images and points3D as .bin or .txt in sparse/0) nor a "
-        f"{', a '.join(READERS)}, nor photos; "
-        + (poses or unread(scene, every=True) or "give the folder of a capture, or of photos")
-    )
