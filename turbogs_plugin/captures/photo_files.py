@@ -206,17 +206,14 @@ def _index(scene: Path, others: Collection[str]) -> dict[str, list[PurePosixPath
     return files
 
 
-def _best(files: Sequence[PurePosixPath], name: str) -> str:
-    """The one of these files that a name stands for; empty where it is not clear."""
-    path = PureWindowsPath(name)
-    files = [file for file in files if plain(file.name) == plain(path.name)] or list(files)
-    ends = [max(n for n in range(1, 1 + len(file.parts)) if file.parts[-n:-1] == path.parts[-n:-1]) for file in files]
-    best = [file for file, end in zip(files, ends, strict=True) if end == max(ends)]
-    return str(best[0]) if len(best) == 1 else ""
-
-
 def _distinct(files: dict[int, list[PurePosixPath]], names: Sequence[str]) -> dict[int, str]:
-    """The file that the name of each place stands for, where it is no other place's."""
-    best = {place: _best(of_place, names[place]) for place, of_place in files.items()}
+    """The file that the name of each place stands for, where it is clear which, and no other place's."""
+    best = {}
+    for place, of_place in files.items():
+        path = PureWindowsPath(names[place])
+        alike = [file for file in of_place if plain(file.name) == plain(path.name)] or of_place
+        ends = [max(n for n in range(1, 1 + len(at.parts)) if at.parts[-n:-1] == path.parts[-n:-1]) for at in alike]
+        if ends.count(max(ends, default=0)) == 1:
+            best[place] = str(alike[ends.index(max(ends))])
     times = Counter(best.values())
-    return {place: path for place, path in best.items() if path and times[path] == 1}
+    return {place: path for place, path in best.items() if times[path] == 1}
