@@ -145,10 +145,14 @@ class _Text:
                 self.words = iter(words)
                 yield self
 
-    def take(self, layout: str) -> tuple:
-        """The next numbers, by a layout of the struct module. Names of sensors and camera models count as numbers."""
+    def take(self, layout: str, last: bool = False) -> tuple:
+        """The next numbers, by a layout of the struct module. Names of sensors and camera models count as numbers.
+        `last`: nothing follows them in their line."""
         codes = (code for count, code in re.findall(r"(\d*)(\D)", layout) for code in code * int(count or 1))
-        return tuple([self._number(code) for code in codes])
+        numbers = tuple([self._number(code) for code in codes])
+        if last and (left := next(self.words, None)):
+            raise self._damaged(f"has {left[:40]!r} after its last number")
+        return numbers
 
     def _number(self, code: str) -> float:
         word = next(self.words, None)
@@ -166,10 +170,6 @@ class _Text:
             return number
         except (ValueError, OverflowError, KeyError):
             raise self._damaged(f"has {word[:40]!r} where a number should be") from None
-
-    def end(self) -> None:
-        if left := next(self.words, None):
-            raise self._damaged(f"has {left[:40]!r} after its last number")
 
     def name(self) -> str:
         """The rest of an image's line, with its spaces. It need not be UTF-8."""
@@ -220,11 +220,8 @@ class _Binary:
         self.position += size
         return start
 
-    def take(self, layout: str) -> tuple:
+    def take(self, layout: str, last: bool = False) -> tuple:
         return struct.unpack_from(f"<{layout}", self.data, self.skip(struct.calcsize(f"<{layout}")))
-
-    def end(self) -> None:
-        pass  # the next record follows
 
     def name(self) -> str:
         if (end := self.data.find(b"\0", self.position)) < 0:
@@ -252,8 +249,7 @@ def _read_cameras(path: Path) -> dict[int, pycolmap.Camera]:
         if not (0 < width < 2**31 and 0 < height < 2**31):
             raise _damaged(path, f"camera {number} is {width}x{height} pixels")
         camera = pycolmap.Camera.create_from_model_name(number, models[model], 1.0, width, height)
-        camera.params = list(record.take(f"{len(camera.params)}d"))
-        record.end()
+        camera.params = list(record.take(f"{len(camera.params)}d", last=True))
         cameras[number] = camera
     return cameras
 
