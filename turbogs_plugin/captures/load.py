@@ -92,8 +92,12 @@ def load_scene(
             raise InputError(f"{name} is {number}: it must be an integer of at least 1")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
         capture = read_capture(scene)
-        capture = capture if len(capture.points) else _with_points(capture)
-    test = _test_views(scene, capture, test_every)
+        test = _test_views(scene, capture, test_every)
+        if not len(capture.points):
+            own = slice(None) if capture.test is None else ~test
+            drawn_points, how = starting_points(capture.viewmats[own], capture.Ks[own], capture.sizes[own])
+            note = f"{len(drawn_points):,} random points are drawn {how}, as the capture has none"
+            capture = replace(capture, points=drawn_points, point_colors=None, notes=(*capture.notes, note))
     if validation:
         note = f"{test.sum()} test photos are left out: photos that choose settings are among the others"
         capture = capture.subset(np.flatnonzero(~test), np.arange(len(capture.points)), (note,))
@@ -166,14 +170,6 @@ def _posed(
         masked = PixelMasks.joined([mask or PixelMasks.of(np.ones(size, dtype=bool)) for mask, size in pairs])
     photos = Photos(torch.empty(0, 3, dtype=torch.uint8), sizes)
     return PosedImages(cameras, tuple(capture.names[view] for view in views), photos, masked, shown)
-
-
-def _with_points(capture: Capture) -> Capture:
-    """The capture, with points drawn about what its training cameras look at."""
-    train = slice(None) if capture.test is None or capture.test.all() else ~capture.test
-    points, how = starting_points(capture.viewmats[train], capture.Ks[train], capture.sizes[train])
-    note = f"{len(points):,} random points are drawn {how}, as the capture has none"
-    return replace(capture, points=points, point_colors=None, notes=(*capture.notes, note))
 
 
 def _test_views(scene: Path, capture: Capture, test_every: int) -> np.ndarray:
