@@ -155,7 +155,11 @@ def find_named(
     if twice := [path for path, times in Counter(written).items() if times > 1]:
         raise InputError(f"{source} names the photo {twice[0]} twice: take one out, or rename the photos")
     missing = [place for place, path in enumerate(found) if path is None]
-    index = {} if not missing else _index(scene, {*written, *(PureWindowsPath(other).as_posix() for other in others)})
+    index = defaultdict(list)  # files of the scene that may be photos, by their stems
+    no_photos = {*written, *(PureWindowsPath(other).as_posix() for other in others)}
+    for file in files_below(scene) if missing else ():
+        if str(file) not in no_photos and file.suffix.lower() in NAMED_SUFFIXES:
+            index[_stem(file.name)].append(file)
     alike = {place: index.get(_stem(names[place]), []) for place in missing}
     said = {place: {PurePosixPath(form).parent for form in _forms(names[place], folders)} for place in missing}
     beside = {place: [file for file in files if file.parent in said[place]] for place, files in alike.items()}
@@ -195,15 +199,6 @@ def _stem(name: str) -> str:
     """A photo's name without folders and suffix, in plain letters. What is no suffix of an image is part of it."""
     path = PureWindowsPath(name)
     return plain(path.stem if path.suffix.lower() in (*NAMED_SUFFIXES, *OTHER_SUFFIXES) else path.name)
-
-
-def _index(scene: Path, others: Collection[str]) -> dict[str, list[PurePosixPath]]:
-    """The files of a scene that may be photos, but for `others`, by their stems."""
-    files = defaultdict(list)
-    for file in files_below(scene):
-        if str(file) not in others and file.suffix.lower() in NAMED_SUFFIXES:
-            files[_stem(file.name)].append(file)
-    return files
 
 
 def _distinct(files: dict[int, list[PurePosixPath]], names: Sequence[str]) -> dict[int, str]:
