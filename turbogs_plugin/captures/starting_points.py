@@ -71,9 +71,8 @@ def starting_points(viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> 
     pull = 1e-3 * len(centers) * np.eye(3)  # a slight one towards the mean settles the case of parallel axes
     offsets = np.einsum("vij,vj->i", across, centers - mean)
     focus = mean + np.linalg.solve(across.sum(axis=0) + pull, offsets)
-    x, y, depth = np.einsum("vij,vj->iv", Ks, viewmats[:, :3, :3] @ focus + viewmats[:, :3, 3])
-    inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < sizes[:, 0] * depth) & (y < sizes[:, 1] * depth)
-    if inside.mean() < LOOKING:
+    looking = [len(seen(focus[None], *camera)[0]) for camera in zip(viewmats, Ks, sizes, strict=True)]
+    if np.mean(looking) < LOOKING:
         points = _in_views(viewmats, Ks, sizes, *_depth_bounds(centers))
         return points, "before the cameras, which do not look at one thing"
     side = float(np.median(np.linalg.norm(centers - focus, axis=1))) or 1.0
