@@ -191,26 +191,22 @@ class _Adjustment:
         sights, roots, residuals = self._counted()
         normals, right = np.zeros_like(self.doubts), np.zeros_like(self.moves)  # of the normal equations
         for view, own in enumerate(self.own):
-            for slopes, residual in zip(self._slopes(view, *sights[:, own]), residuals[:, own], strict=True):
-                slopes *= roots[own]
-                normals[view] += slopes @ slopes.T
-                right[view] += slopes @ residual
+            p, q, near = sights[:, own]
+            near = near * self.depths[view]
+            # How x and y of a pixel change by each parameter.
+            across, down = slopes = np.zeros((2, PARAMETERS, len(p)))
+            across[0], across[1], across[2], across[3], across[5], across[6] = -p * q, 1 + p * p, -q, near, -p * near, p
+            down[0], down[1], down[2], down[4], down[5], down[7] = -1 - q * q, p * q, p, near, -q * near, q
+            slopes *= self.cameras.focal[view][:, None, None]
+            across[8] = down[9] = self.cameras.half_widths[view]
+            slopes *= roots[own]
+            normals[view] = across @ across.T + down @ down.T
+            right[view] = across @ residuals[0, own] + down @ residuals[1, own]
         told, prior = self.counts >= FEWEST_OBSERVATIONS, np.linalg.inv(self.spread)
         self.doubts[told] = np.linalg.inv(normals[told] + prior)
         steps = np.einsum("vab,vb->va", self.doubts, right - self.moves @ prior)
         self.moves += steps
         self.cameras = self.cameras.moved(steps, self.depths)
-
-    def _slopes(self, view: int, p: np.ndarray, q: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """[2, PARAMETERS, N]: how x and y of a pixel change by each parameter of its camera; of points at x / z, y / z
-        and 1 / z."""
-        near = near * self.depths[view]
-        across, down = slopes = np.zeros((2, PARAMETERS, len(p)))
-        across[0], across[1], across[2], across[3], across[5], across[6] = -p * q, 1.0 + p * p, -q, near, -p * near, p
-        down[0], down[1], down[2], down[4], down[5], down[7] = -1.0 - q * q, p * q, p, near, -q * near, q
-        slopes *= self.cameras.focal[view][:, None, None]
-        across[8] = down[9] = self.cameras.half_widths[view]
-        return slopes
 
     def learn_spread(self) -> None:
         """One step of expectation-maximisation of the prior."""
