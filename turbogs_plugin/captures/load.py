@@ -225,9 +225,9 @@ def _find_photos(scene: Path, capture: Capture, factor: int) -> tuple[list[Path]
         note = f"{wrong.sum()} photos in another size than their cameras: intrinsics rescaled from {camera} to {size}"
     reduction = re.fullmatch(rf"{IMAGES}_(\d+)", capture.photo_folder.name)
     already = int(reduction[1]) if reduction and cameras[0, 0] > 1.5 * sizes[0, 0] else 1
-    pairs = zip(capture.lenses, sizes.tolist(), strict=True)
-    undistorted = np.array([size if lens is None else lens.size_of(size) for lens, size in pairs], dtype=np.int64)
-    return paths, sizes, reduced_sizes(undistorted, max(1.0, factor / already)), note
+    # Images of lenses are smaller for smaller photos, never larger.
+    undistorted = np.floor(capture.sizes * (sizes / cameras).clip(max=1.0) + 0.5).astype(np.int64).clip(min=1)
+    return paths, sizes, reduced_sizes(np.where(bent[:, None], undistorted, sizes), max(1.0, factor / already)), note
 
 
 def read_capture(scene: Path) -> Capture:

@@ -57,12 +57,6 @@ class Lens:
         """(width, height) of the photos that it was calibrated on."""
         return self.camera.width, self.camera.height
 
-    def size_of(self, photo_size: tuple[int, int]) -> tuple[int, int]:
-        """(width, height) of the pinhole's image for photos of a size: smaller for a smaller photo, never larger."""
-        ratios = np.divide(photo_size, self.photo_size).clip(max=1.0)
-        width, height = np.floor(np.multiply(self.size, ratios) + 0.5).astype(np.int64).clip(min=1).tolist()
-        return width, height
-
     def undistort(self, photo: Image.Image) -> Image.Image:
         """The pinhole's image, of `size`. Photos of another size than `photo_size` get that first."""
         pycolmap = load_pycolmap()
