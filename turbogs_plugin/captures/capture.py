@@ -31,7 +31,7 @@ class Capture:
         Ks: [V, 3, 3] float64, intrinsics of the full-size photos, undistorted where they have a lens.
         sizes: [V, 2] int64 (width, height) of the full-size photos, undistorted where they have a lens.
         points: [M, 3] float64; M is 0 where `load_scene` is to draw them.
-        point_colors: [M, 3] uint8; None: points are random, and their colours are the photos' (`colors_in_photos`).
+        point_colors: [M, 3] uint8.
         lenses: one a view, None for a pinhole camera.
         mask_files: files of masks that the capture names, one a view or None.
         notes: what the capture was taken for, and what was done with it: lines for the user.
@@ -48,7 +48,7 @@ class Capture:
     Ks: np.ndarray
     sizes: np.ndarray
     points: np.ndarray
-    point_colors: np.ndarray | None
+    point_colors: np.ndarray
     lenses: tuple[Lens | None, ...]
     mask_files: tuple[Path | None, ...]
     notes: tuple[str, ...]

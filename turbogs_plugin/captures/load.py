@@ -93,11 +93,11 @@ def load_scene(
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused by its name
         capture = read_capture(scene)
         test = _test_views(scene, capture, test_every)
-        if not len(capture.points):
+        if drawn := not len(capture.points):
             own = slice(None) if capture.test is None else ~test
-            drawn_points, how = starting_points(capture.viewmats[own], capture.Ks[own], capture.sizes[own])
-            note = f"{len(drawn_points):,} random points are drawn {how}, as the capture has none"
-            capture = replace(capture, points=drawn_points, point_colors=None, notes=(*capture.notes, note))
+            places, how = starting_points(capture.viewmats[own], capture.Ks[own], capture.sizes[own])
+            notes = (*capture.notes, f"{len(places):,} random points are drawn {how}, as the capture has none")
+            capture = replace(capture, points=places, point_colors=np.zeros(places.shape, np.uint8), notes=notes)
     if validation:
         note = f"{test.sum()} test photos are left out: photos that choose settings are among the others"
         capture = capture.subset(np.flatnonzero(~test), np.arange(len(capture.points)), (note,))
@@ -122,8 +122,7 @@ def load_scene(
     paths, lenses = [files[view] for view in views], [capture.lenses[view] for view in views]
     channels = channels_of(paths) if capture.alpha == "opacity" else 3
     train, tested = (_posed(capture, frame, masks, part, sizes[part]) for part in parts)
-    name, given, drawn = scene.resolve().name, capture.point_colors, capture.point_colors is None
-    colors = torch.zeros_like(points, dtype=torch.uint8) if given is None else torch.from_numpy(given)
+    name, colors = scene.resolve().name, torch.from_numpy(capture.point_colors)
     loaded = Scene(name, train, tested, points, colors, frame, extent=1.0, drawn_points=drawn, doubt=capture.doubt)
     # In one array: its room is found once.
     photos = load_photos(paths, sizes[views], lenses, channels, progress, lambda: meanwhile(loaded))

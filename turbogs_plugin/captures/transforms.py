@@ -112,7 +112,7 @@ def _capture(source: Path, content: dict[str, Any], frames: list[Frame], test: s
     axes = {"opengl": np.eye(4), "opencv": OTHER_AXES}.get(str(content.get("axes", "opengl")).lower())
     if axes is None:
         raise InputError(f'{source}: its axes are {str(content["axes"])[:40]!r}: write "opengl" or "opencv"')
-    points, colors, file = np.empty((0, 3)), None, None
+    points, colors, file = np.empty((0, 3)), np.empty((0, 3), np.uint8), None
     if cloud is not None:
         points, colors, grey = read_cloud(file := _file(cloud, "ply_file_path", source))
         words += f", {len(points):,} points of {cloud}{grey}"
