@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
@@ -19,9 +18,6 @@ from PIL import Image
 from turbogs_plugin.captures.colmap import load_pycolmap, write_whole
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import look_at
-
-if TYPE_CHECKING:
-    import pycolmap
 
 Texture = Callable[[np.ndarray], np.ndarray]  # [R, 3] points in the solid's own coordinates -> [R, 3] colours
 RAYS_PER_SIDE = 3  # each pixel is the mean of this many rays squared; odd, so that one goes through its centre
@@ -155,13 +151,14 @@ def write_demo_capture(path: str | Path, seed: int = 0, views: int = 32, width: 
         capture = Path(temporary) / "capture"
         for folder in ("images", "sparse/0"):
             (capture / folder).mkdir(parents=True)
-        write_whole(_photographed(capture / "images", seed, views, width, height), capture / "sparse/0", target)
+        _photograph(capture, target, seed, views, width, height)
         capture.rename(target)
     return target
 
 
-def _photographed(folder: Path, seed: int, views: int, width: int, height: int) -> pycolmap.Reconstruction:
-    """Write the photos, from a ring about the table that swings in height; and what COLMAP would have made of them."""
+def _photograph(capture: Path, target: Path, seed: int, views: int, width: int, height: int) -> None:
+    """Write the photos, from a ring about the table that swings in height; and what COLMAP would have made of them.
+    `target` is the capture's folder for the user."""
     random, side, focal = np.random.default_rng(seed), RAYS_PER_SIDE, FOCAL * width
     poses, solids = np.empty((views, 3, 4)), demo_solids(random)
     x, y = np.meshgrid((np.arange(width * side) + 0.5) / side, (np.arange(height * side) + 0.5) / side)
@@ -179,7 +176,7 @@ def _photographed(folder: Path, seed: int, views: int, width: int, height: int) 
         directions /= lengths
         seen, distances = cast(solids, origin, directions)
         pixels = seen.reshape(height, side, width, side, 3).mean(axis=(1, 3))
-        Image.fromarray(np.round(pixels * 255).astype(np.uint8)).save(folder / PHOTO_NAME.format(view))
+        Image.fromarray(np.round(pixels * 255).astype(np.uint8)).save(capture / "images" / PHOTO_NAME.format(view))
         centers = np.s_[side // 2 :: side, side // 2 :: side]
         depths[view] = (distances[:, None] / lengths).reshape(height * side, width * side)[centers]
         hits = np.flatnonzero(np.isfinite(distances))
@@ -211,4 +208,4 @@ def _photographed(folder: Path, seed: int, views: int, width: int, height: int) 
         track = pycolmap.Track([pycolmap.TrackElement(view + 1, numbers[view, point]) for view in seen_by])
         reconstruction.add_point3D(displaced[point], track, np.round(colors[point] * 255).astype(np.uint8))
     reconstruction.update_point_3d_errors()
-    return reconstruction
+    write_whole(reconstruction, capture / "sparse/0", target)
