@@ -66,8 +66,6 @@ class Capture:
     def checked(self, source: Path) -> Capture:
         """This capture without damaged views and points, which a note counts. Raises `InputError` where no point is
         finite, or fewer than `FEWEST_PHOTOS` training views are whole."""
-        if not self.names:
-            raise InputError(f"{source} has no images with a pose: reconstruct the capture again")
         posed = np.isfinite(self.viewmats).all(axis=(1, 2))
         lensed = (np.abs(self.Ks) < LARGEST_PIXEL).all(axis=(1, 2))
         lensed &= (self.Ks[:, [0, 1], [0, 1]] > 1.0 / LARGEST_PIXEL).all(axis=1)

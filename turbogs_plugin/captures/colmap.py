@@ -55,7 +55,8 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     fewer than `FEWEST_PHOTOS` photos."""
     model = read_model(folder, suffix)
     found = find_named(scene, [image.name for image in model.images], folder, (IMAGES, ""))
-    images = [model.images[place] for place in found.places]
+    if not (images := [model.images[place] for place in found.places]):
+        raise InputError(f"{folder} has no images with a pose: reconstruct the capture again")
     ids = {image.camera for image in images}
     lenses = {id: lens_of_camera(model.cameras[id], f"camera {id} of {folder}") for id in ids}
     pairs = [(model.cameras[image.camera], lenses[image.camera]) for image in images]
@@ -73,9 +74,9 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     return Capture(
         names=found.names,
         photo_folder=found.folder,
-        viewmats=np.array([image.viewmat for image in images]).reshape(-1, 4, 4),
-        Ks=np.array(Ks).reshape(-1, 3, 3),
-        sizes=np.array(sizes, dtype=np.int64).reshape(-1, 2),
+        viewmats=np.array([image.viewmat for image in images]),
+        Ks=np.array(Ks),
+        sizes=np.array(sizes),
         points=model.points["xyz"].copy(),
         point_colors=model.points["color"].copy(),
         lenses=tuple(lens for _, lens in pairs),
@@ -111,8 +112,7 @@ def _own_split(scene: Path, folder: Path, names: Sequence[str]) -> tuple[np.ndar
 def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict[int, Lens | None]) -> Observations:
     """Places where images, the views, show points that are there, in pixels of their pinhole cameras. `lenses`: by the
     cameras' identifiers, None for a pinhole."""
-    ids = model.points["id"]
-    parts = [(np.zeros((0, 2)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
+    ids, parts = model.points["id"], []
     for view, image in enumerate(images):
         shown = image.features[image.features["point"] != colmap_files.NO_POINT]
         points = np.searchsorted(ids, shown["point"])
