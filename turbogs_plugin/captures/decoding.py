@@ -6,12 +6,12 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import ExifTags, Image, UnidentifiedImageError
-from torch import Tensor
 
 from turbogs_plugin.captures.undistort import Lens
 from turbogs_plugin.device import processor_cores
@@ -113,12 +113,8 @@ def load_photos(
     """
     # Pillow's mode with an a has colours that are multiplied by alpha.
     offsets, mode = pixel_offsets(targets), "RGBa" if channels == 4 else "RGB"
-
-    def room(channels: int) -> Tensor:
-        """[X, channels] uint8, with any content."""
-        return host_array((int(offsets[-1]), channels), torch.uint8, f"{len(targets)} photos")
-
-    colors = room(channels)
+    room = partial(host_array, dtype=torch.uint8, what=f"{len(targets)} photos")
+    colors = room((int(offsets[-1]), channels))
     pixels = colors.numpy()
 
     def load(view: int) -> bool:
@@ -145,7 +141,7 @@ def load_photos(
             if progress is not None:
                 progress(count, len(paths))
     if opaque and channels == 4:
-        colors = room(3).copy_(colors[:, :3])
+        colors = room((len(colors), 3)).copy_(colors[:, :3])
     return Photos(colors, targets)
 
 
