@@ -90,22 +90,18 @@ class Capture:
 
     def subset(self, views: np.ndarray, points: np.ndarray, notes: tuple[str, ...]) -> Capture:
         """Some views and points, both ascending, and more notes."""
-
-        def rows(name: str, kept: np.ndarray) -> Any:
-            if isinstance(values := getattr(self, name), tuple):
-                return tuple(values[row] for row in kept)
-            return None if values is None else values[kept]
-
         shown = self.observations
         if shown is not None:
             shown = shown.of_views(views, np.ones((len(views), 2)))
             there = np.isin(shown.point_ids, points)
             ids = np.searchsorted(points, shown.point_ids[there])
             shown = Observations(shown.pixels[there], shown.view_ids[there], ids)
-        per_view = ("names", "viewmats", "Ks", "sizes", "lenses", "test", "mask_files")
-        kept: dict[str, Any] = {name: rows(name, views) for name in per_view}
-        kept |= {name: rows(name, points) for name in ("points", "point_colors")}
-        return replace(self, notes=(*self.notes, *notes), observations=shown, **kept)
+        lists = ("names", "lenses", "mask_files")
+        kept: dict[str, Any] = {name: tuple(getattr(self, name)[view] for view in views) for name in lists}
+        kept |= {name: getattr(self, name)[views] for name in ("viewmats", "Ks", "sizes")}
+        kept |= {name: getattr(self, name)[points] for name in ("points", "point_colors")}
+        test = None if self.test is None else self.test[views]
+        return replace(self, notes=(*self.notes, *notes), test=test, observations=shown, **kept)
 
 
 def bytes_of(path: Path) -> bytes:
