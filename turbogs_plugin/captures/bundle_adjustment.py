@@ -43,7 +43,6 @@ FARTHEST_MATCH = 0.02
 """Share of a photo's width: photos are others than the reconstructed ones where half of the points are farther from
 where photos show them."""
 PARAMETERS = 10
-UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # entries of a symmetric 3x3 matrix, (row, column)
 
 
 class Pinholes(NamedTuple):
@@ -224,7 +223,7 @@ class _Adjustment:
             scales = focal[:, None] * (sights[2, own] * roots[own])
             sides, ahead = rotation[:2, :, None], rotation[2][:, None]
             x, y = (sides - sights[:2, None, own] * ahead) * scales[:, None]  # [3, N]: how a pixel changes by the point
-            for row, (i, j) in enumerate(UPPER):
+            for row, (i, j) in enumerate(itertools.combinations_with_replacement(range(3), 2)):
                 entries[row, own] = x[i] * x[j] + y[i] * y[j]
             entries[6:, own] = x * residuals[0, own] + y * residuals[1, own]
         seen = np.bincount(self.point_ids, entries[0] + entries[3] + entries[5] > 0, count)

@@ -102,7 +102,6 @@ def load_photos(
 
     Args:
         targets: [V, 2] int64 (width, height) to give them.
-        lenses: one a photo, None for a pinhole camera.
         channels: 3, where photos that are transparent lose their alpha and keep their colours as stored; or 4, where
             3 are kept after all if every pixel is opaque.
         progress: called with the number of photos decoded so far, and of all.
