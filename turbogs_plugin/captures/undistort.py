@@ -91,7 +91,8 @@ def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
 
 @lru_cache(maxsize=64)
 def _lens(model: str, size: tuple[int, int], params: tuple[float, ...]) -> Lens | None:
-    """The lens of a camera's numbers, which the cameras of many photos share; None where they are not those of one."""
+    """The lens of a camera's numbers, which the cameras of many photos share; None where they are not those of one: the
+    photo does not fill the pinhole image, or shows some of it mirrored."""
     pycolmap = load_pycolmap()
     if not np.isfinite(params).all():
         return None
@@ -101,26 +102,21 @@ def _lens(model: str, size: tuple[int, int], params: tuple[float, ...]) -> Lens 
     except Exception:  # pycolmap raises whatever C++ threw
         return None
     lens = Lens(camera, (pinhole.width, pinhole.height), pinhole.calibration_matrix())
-    return lens if _fits(lens) else None
+    K, (x, y) = lens.K, (np.linspace(0.0, side, GRID) for side in lens.size)
+    rays = np.stack([*np.meshgrid((x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]), np.ones((GRID, GRID))], axis=-1)
+    with np.errstate(all="ignore"):
+        places = np.asarray(camera.img_from_cam(rays.reshape(-1, 3)))  # NaN where there is none
+        least, most = places.min(axis=0), places.max(axis=0)  # NaN fits nowhere
+        fits = (least >= -EDGE) & (most <= np.add(size, EDGE)) & (most - least >= np.multiply(SMALLEST_SHARE, size))
+        places = places.reshape(GRID, GRID, 2)
+        right, down = places[:-1, 1:] - places[:-1, :-1], places[1:, :-1] - places[:-1, :-1]
+        upright = right[..., 0] * down[..., 1] > right[..., 1] * down[..., 0]
+    return lens if fits.all() and upright.all() else None
 
 
 def _options() -> pycolmap.UndistortCameraOptions:
     pycolmap = load_pycolmap()
     return pycolmap.UndistortCameraOptions(blank_pixels=0.0, max_scale=LARGEST_GROWTH, max_cam_point_norm=WIDEST)
-
-
-def _fits(lens: Lens) -> bool:
-    """True where the photo of a camera fills the pinhole image, and shows none of it mirrored."""
-    sides, K, (x, y) = lens.photo_size, lens.K, (np.linspace(0.0, side, GRID) for side in lens.size)
-    rays = np.stack([*np.meshgrid((x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]), np.ones((GRID, GRID))], axis=-1)
-    with np.errstate(all="ignore"):
-        places = np.asarray(lens.camera.img_from_cam(rays.reshape(-1, 3)))  # NaN where there is none
-        least, most = places.min(axis=0), places.max(axis=0)  # NaN fits nowhere
-        fits = (least >= -EDGE) & (most <= np.add(sides, EDGE)) & (most - least >= np.multiply(SMALLEST_SHARE, sides))
-        places = places.reshape(GRID, GRID, 2)
-        right, down = places[:-1, 1:] - places[:-1, :-1], places[1:, :-1] - places[:-1, :-1]
-        upright = right[..., 0] * down[..., 1] > right[..., 1] * down[..., 0]
-    return bool(fits.all() and upright.all())
 
 
 def undistortion_note(lenses: Sequence[Lens | None]) -> str:
