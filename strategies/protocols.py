@@ -112,6 +112,11 @@ class DensityController(Protocol):
         """The statistics that backward passes add to, or None while none are needed."""
         return None
 
+    @property
+    def uses_errors(self) -> bool:
+        """True where `update` looks at error or distance sums. Elsewhere they cost no time, and mean nothing."""
+        return self.stats is not None
+
     def setup(self, gaussians: Gaussians) -> None:
         """Called once before training, and after a resume, before `load_state_dict`."""
         return

@@ -138,7 +138,7 @@ struct BackwardParams {
     const float* color_gradients;  // [P, 3]
     const float* alpha_gradients;  // [P] or null
     const float* depth_gradients;  // [P] or null
-    const float* pixel_errors;     // [P] or null
+    const float* pixel_errors;     // [P], or null: error and distance sums are zero
     float* records;                // [K, N, 16] added to, ScreenRecord
 };
 

@@ -23,16 +23,21 @@ constexpr int kAhead = 4;                           // splats whose arithmetic o
 constexpr int kBucketLanes = 4;                     // lanes that list the splats of one bucket
 constexpr int kLaneBits = kBucket / kBucketLanes;   // bits of its mask that each of them takes
 constexpr int kListBuckets = kWarpSize / kBucketLanes;  // buckets whose bits become a list at once
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900 && __CUDA_ARCH__ < 1200
+constexpr int kWarpsPerSm = 28;  // as many as shared memory holds: 72 registers at most
+#else
+constexpr int kWarpsPerSm = 1;  // no bound
+#endif
 constexpr float kTwoLn2 = 1.3862943611198906f;          // d sigma = 2 ln(2) (u du + v dv)
 
-template <bool kDepth>
+template <bool kDepth, bool kErrors>
 struct BackwardShared {
-    // As float2, two samples' values are one load of 16 bytes, and 28 warps fit an SM, not 27.
-    using Others = std::conditional_t<kDepth, float4, float2>;
+    // Two samples' float2 or four samples' float1 are one load of 16 bytes.
+    using Others = std::conditional_t<kDepth, float4, std::conditional_t<kErrors, float2, float1>>;
     float4 weights[kSplats * kExchangeStride / 4];  // [splat][sample]
     float4 slopes[kSplats * kExchangeStride / 4];   // [splat][sample]: d loss / d sigma
     float4 positions[kWarpSize];                    // of the samples: x, y, gradients of red and green
-    Others others[kWarpSize];                       // gradient of blue, error, if asked for gradient of the depth sum
+    Others others[kWarpSize];                       // gradient of blue; if asked for error, gradient of the depth sum
     StagedSplat splats[kSplats];
     int pending[kListBuckets * kBucket + kSplats];  // intersections to walk, back to front
 };
@@ -63,9 +68,10 @@ struct Sample {
 
 // Reads a lane's sample: upstream gradients, and where the forward pass ended. Leaves in shared memory what phase 2
 // needs.
-template <bool kDepth>
+template <bool kDepth, bool kErrors>
 __device__ __forceinline__ Sample load_sample(const BackwardParams& params, int slot, int slot_end,
-                                              const TileFrame& frame, BackwardShared<kDepth>& shared, int lane) {
+                                              const TileFrame& frame, BackwardShared<kDepth, kErrors>& shared,
+                                              int lane) {
     const ForwardParams& forward = params.forward;
     const int pixel = slot < slot_end ? forward.pixel_ids[slot] : -1;
     Sample sample = {};
@@ -78,7 +84,7 @@ __device__ __forceinline__ Sample load_sample(const BackwardParams& params, int 
         sample.red = color[0];
         sample.green = color[1];
         sample.blue = color[2];
-        if (params.pixel_errors != nullptr) error = params.pixel_errors[slot];
+        if (kErrors) error = params.pixel_errors[slot];
         sample.last = forward.last_intersections[slot];
         sample.transmittance = forward.transmittances[slot];
         float alpha_gradient = params.alpha_gradients != nullptr ? params.alpha_gradients[slot] : 0.0f;
@@ -96,7 +102,8 @@ __device__ __forceinline__ Sample load_sample(const BackwardParams& params, int 
     sample.filled = kWarpSize - __clz(static_cast<int>(__ballot_sync(kFullWarp, pixel >= 0)));
     shared.positions[lane] = make_float4(sample.x, sample.y, sample.red, sample.green);
     if constexpr (kDepth) shared.others[lane] = make_float4(sample.blue, error, sample.depth, 0.0f);
-    else shared.others[lane] = make_float2(sample.blue, error);
+    else if constexpr (kErrors) shared.others[lane] = make_float2(sample.blue, error);
+    else shared.others[lane] = make_float1(sample.blue);
     return sample;
 }
 
@@ -120,9 +127,10 @@ __device__ __forceinline__ int list_intersections(const uint32_t* masks, int chu
 
 // Phase 1, lane = sample: (w, d loss / d sigma) of each staged splat. No branches, so that several splats overlap; the
 // power is taken even where it is not needed, as the compiler may branch about it otherwise.
-template <bool kDepth>
+template <bool kDepth, bool kErrors>
 __device__ __forceinline__ void exchange_splats(const ForwardParams& forward, float least_level,
-                                                BackwardShared<kDepth>& shared, Sample& sample, int count, int lane) {
+                                                BackwardShared<kDepth, kErrors>& shared, Sample& sample, int count,
+                                                int lane) {
     float* weights = reinterpret_cast<float*>(shared.weights) + lane;
     float* slopes = reinterpret_cast<float*>(shared.slopes) + lane;
     for (int base = 0; base < count; base += kAhead) {
@@ -161,9 +169,9 @@ struct SplatSums {
 // Phase 2, lane = splat and share: adds the samples of the share to the lane's sums. The shares take turns, so that
 // both are done with the last of the `filled` samples; all lanes leave after the same turn. What a turn reads behind
 // the last sample adds zeros, as every empty sample does.
-template <bool kDepth, bool kDensity>
-__device__ __forceinline__ void sum_samples(const BackwardShared<kDepth>& shared, int filled, int row, int share,
-                                            const StagedSplat& own, SplatSums& sums) {
+template <bool kDensity, bool kDepth, bool kErrors>
+__device__ __forceinline__ void sum_samples(const BackwardShared<kDepth, kErrors>& shared, int filled, int row,
+                                            int share, const StagedSplat& own, SplatSums& sums) {
     static_assert(kWarpSize % (kShares * kTurn) == 0, "shares of the same size");
     const float4* weights = shared.weights + (row * kExchangeStride + share * kTurn) / 4;
     const float4* slopes = shared.slopes + (row * kExchangeStride + share * kTurn) / 4;
@@ -176,7 +184,7 @@ __device__ __forceinline__ void sum_samples(const BackwardShared<kDepth>& shared
         sums.red += weight * position.z;
         sums.green += weight * position.w;
         sums.blue += weight * other.x;
-        sums.error += weight * other.y;
+        if constexpr (kErrors) sums.error += weight * other.y;
         sums.weight += weight;
         const float2 f = splat_form(own.form, own.rest.x, position.x, position.y);
         const float slope_u = slope * f.x, slope_v = slope * f.y;
@@ -187,11 +195,11 @@ __device__ __forceinline__ void sum_samples(const BackwardShared<kDepth>& shared
         sums.uv += slope_u * f.y;
         sums.vv += slope_v * f.y;
         if constexpr (kDepth) sums.depth += weight * other.z;
+        if (kDensity && kErrors) sums.distance += weight * approximate_sqrt_flushed(f.x * f.x + f.y * f.y);
         if (kDensity) {
             sums.absolute_x += fabsf(slope_u);
             sums.absolute_y += fabsf(own.form.y * slope_u + own.form.z * slope_v);
             sums.square += slope * slope;
-            sums.distance += weight * approximate_sqrt_flushed(f.x * f.x + f.y * f.y);
         }
     };
 #pragma unroll
@@ -247,9 +255,9 @@ __device__ __forceinline__ void send_record(float* target, const float record[Sc
     add_quad(target + 4, sum[4], sum[5], sum[6], sum[7]);
 }
 
-template <bool kDepth, bool kDensity>
-__global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_constant__ BackwardParams params) {
-    __shared__ BackwardShared<kDepth> shared;
+template <bool kDepth, bool kErrors, bool kDensity>
+__global__ void __launch_bounds__(kWarpSize, kWarpsPerSm) backward_kernel(const __grid_constant__ BackwardParams params) {
+    __shared__ BackwardShared<kDepth, kErrors> shared;
     const ForwardParams& forward = params.forward;
     const int lane = threadIdx.x, row = lane % kSplats, share = lane / kSplats;
     const int item = blockIdx.x;
@@ -265,7 +273,7 @@ __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_consta
 
     for (int slot_base = forward.tile_offsets[tile] + chunk * kWarpSize; slot_base < slot_end;
          slot_base += forward.chunks * kWarpSize) {
-        Sample sample = load_sample<kDepth>(params, slot_base + lane, slot_end, frame, shared, lane);
+        Sample sample = load_sample(params, slot_base + lane, slot_end, frame, shared, lane);
         int buckets_left = num_buckets, begin = 0, end = 0;  // of the list
         while (true) {
             if (end - begin < kSplats && buckets_left > 0) {
@@ -294,10 +302,10 @@ __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_consta
             if (share == 0) shared.splats[row] = own;
             begin += count;
             __syncwarp();
-            exchange_splats<kDepth>(forward, least_level, shared, sample, count, lane);
+            exchange_splats(forward, least_level, shared, sample, count, lane);
             __syncwarp();
             SplatSums sums;
-            sum_samples<kDepth, kDensity>(shared, sample.filled, row, share, own, sums);
+            sum_samples<kDensity>(shared, sample.filled, row, share, own, sums);
             float record[ScreenRecord::kSize];
             make_record(own, sums, record);
             float* target = params.records + static_cast<size_t>(instance) * ScreenRecord::kSize;
@@ -307,15 +315,20 @@ __global__ void __launch_bounds__(kWarpSize) backward_kernel(const __grid_consta
     }
 }
 
+template <bool kDepth>
+auto kernel_of(const BackwardParams& params) {
+    const bool density = params.with_density_sums;
+    return params.pixel_errors != nullptr
+               ? (density ? backward_kernel<kDepth, true, true> : backward_kernel<kDepth, true, false>)
+               : (density ? backward_kernel<kDepth, false, true> : backward_kernel<kDepth, false, false>);
+}
+
 }  // namespace
 
 void launch_rasterize_backward(const BackwardParams& params, cudaStream_t stream) {
     const int items = params.forward.num_active * params.forward.chunks;
     if (items == 0) return;
-    const bool density = params.with_density_sums;
-    const auto kernel = params.depth_gradients != nullptr
-                            ? (density ? backward_kernel<true, true> : backward_kernel<true, false>)
-                            : (density ? backward_kernel<false, true> : backward_kernel<false, false>);
+    const auto kernel = params.depth_gradients != nullptr ? kernel_of<true>(params) : kernel_of<false>(params);
     kernel<<<items, kWarpSize, 0, stream>>>(params);
 }
 

@@ -138,6 +138,10 @@ class ErrorDrivenDensity(WindowedDensity):
             self.stats = None
         return update
 
+    @property
+    def uses_errors(self) -> bool:
+        return self.stats is not None and self.choose_by == "difficulty"
+
     def scores(self, step: Step) -> tuple[Tensor, Tensor]:
         """([N] difficulty score, [N] bool seen) of the present window. The score 0 of an unseen one has no meaning."""
         stats, seen = self.window, self._seen()

@@ -116,11 +116,17 @@ def test_every_division_of_the_work_gives_the_same(warps, monkeypatch):
     monkeypatch.setattr(cuda, "warps_per_tile", lambda slots, tiles: warps)
     got = cuda.rasterize_cuda(case.gpu_gaussians, case.gpu_cameras, case.gpu_samples)
     assert_forward_close(got.colors, wanted.colors, "colors")
-    records, plain = (got.backward(**on_gpu(values), with_statistics=asked).full_records() for asked in (True, False))
     wanted_records = wanted.backward(**values).full_records()
-    for name, column in RECORD_COLUMNS.items():
-        assert_gradients_close(records[..., column], wanted_records[..., column], name)
-        if name in ("absolute", "distance_sum", "square_sum"):
-            assert (plain[..., column] == 0).all()
-        else:
-            assert_gradients_close(plain[..., column], wanted_records[..., column], f"{name} without a window")
+    given = on_gpu(values)
+    passes = (  # upstream and options, the sums that are zero
+        (given | {"with_statistics": True}, ()),
+        (given, ("absolute", "distance_sum", "square_sum")),
+        (given | {"with_statistics": True, "pixel_errors": None}, ("error_sum", "distance_sum")),
+    )
+    for arguments, zero in passes:
+        records = got.backward(**arguments).full_records()
+        for name, column in RECORD_COLUMNS.items():
+            if name in zero:
+                assert (records[..., column] == 0).all()
+            else:
+                assert_gradients_close(records[..., column], wanted_records[..., column], f"{name}, zero: {zero}")

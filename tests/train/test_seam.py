@@ -94,10 +94,19 @@ def test_statistics_are_written_once_whatever_the_optimizer_does(capture, calls)
     assert_equal_statistics(odd, usual)
 
 
+@pytest.mark.parametrize("choose_by", ["difficulty", "squares"])
+def test_errors_are_carried_to_the_gaussians_for_a_control_that_uses_them(capture, choose_by):
+    trainer = tiny_trainer(capture)
+    trainer.density.choose_by = choose_by
+    run(trainer, 1)
+    assert bool(trainer.density.stats.error_sums.any()) == (choose_by == "difficulty")
+    assert trainer.density.stats.square_sums.any() and trainer.density.stats.weight_sums.any()
+
+
 class Restless:
     """A density control that moves every mean in each iteration, without a change of the set of Gaussians."""
 
-    moves_model, stats = True, None
+    moves_model, stats, uses_errors = True, None, False
 
     def setup(self, gaussians):
         pass

@@ -56,7 +56,8 @@ class ScreenRecord:
 
     w is the weight of a sample (transmittance times alpha), e its error, D its distance from the mean in standard
     deviations (Mahalanobis). Sums run over the samples. `ABSOLUTE`, `DISTANCE_SUM` and `SQUARE_SUM` are for density
-    control alone: the kernels leave them zero where it does not ask for them.
+    control alone: the kernels leave them zero where it does not ask for them. Without the pixels' errors, they leave
+    `ERROR_SUM` and `DISTANCE_SUM` zero.
     """
 
     MEAN = slice(0, 2)  # d loss / d projected mean, in pixels

@@ -114,7 +114,7 @@ class Rendered(ABC):
 
         Args:
             color_gradients: [P, 3] d loss / d colors.
-            pixel_errors: [P] the errors to carry to the Gaussians; None for zeros.
+            pixel_errors: [P] the errors to carry to the Gaussians. None: error and distance sums then mean nothing.
             with_statistics: also sum up what `GaussianStats` needs (absolute gradients, squares, distances).
             alpha_gradients, depth_gradients: [P], where the loss has such terms.
 

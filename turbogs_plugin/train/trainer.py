@@ -72,7 +72,7 @@ class Trainer(TrainingState):
         stats = self.density.stats
         screen = rendered.backward(
             loss.color_gradients,
-            loss.pixel_errors,
+            loss.pixel_errors if self.density.uses_errors else None,
             with_statistics=stats is not None,
             depth_gradients=loss.depth_gradients,
         )
