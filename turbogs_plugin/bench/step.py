@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -58,6 +59,7 @@ def bench_step(
         bandwidth = copy_bandwidth(device)
         for count in views:
             config = timed_config(overrides, count)
+            gc.collect()  # of the trainer before, whose memory would count as held
             held = torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
             trainer = trainer_of(config, scene, model, device)
             trainer.iteration = config.train.sh_degree  # every band is in use
