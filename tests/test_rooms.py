@@ -39,7 +39,7 @@ BUDGETS = {
     "turbogs_plugin/{config,plan}": 1_500,
     "turbogs_plugin/train": 2_300,
     "turbogs_plugin/reconstruct": 850,
-    "turbogs_plugin/report": 700,
+    "turbogs_plugin/report": 655,
     "turbogs_plugin/study": 1_200,
     "turbogs_plugin/viewer": 800,
     "turbogs_plugin/export": 700,
@@ -49,7 +49,7 @@ BUDGETS = {
     "strategies": 2_000,
     "csrc": 6_000,
     "tests": 24_044,
-    "docs": 915,
+    "docs": 960,
 }
 """Folder or modules -> the most lines of Python, and of CUDA in csrc.
 
@@ -58,7 +58,7 @@ Whoever needs more takes something out, or says in the change which measured gai
 
 STILL_LARGER = {
     "turbogs_plugin/captures": (
-        2_715,
+        2_602,
         "bundle adjustment (.18 to .5 dB); files as other programs and scripts leave them; depth maps, .exr too; scans",
     ),
     "turbogs_plugin/export": (786, "glTF, OpenUSD and .spz 2; a local origin for UTM captures; size and rate of films"),

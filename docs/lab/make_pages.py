@@ -31,13 +31,13 @@ TABLES: dict[str, Callable[[], str]] = {
     "ideas": paper_tables.ideas,
     "paper whole": paper_tables.paper_whole,
     "wall": timings.wall,
-    "steps h200": partial(timings.steps, "step-h200.json"),
-    "steps h100": partial(timings.steps, "step-h100.json"),
+    "steps": timings.steps,
     "raster": timings.raster,
     "gsplat main": timings.gsplat_main,
     "ranks": timings.ranks,
     "rank runs": timings.rank_runs,
     "dropin": timings.dropin,
+    "whole step": timings.whole_step,
     "pixels on an mlp": timings.pixels_on_an_mlp,
 }
 

@@ -89,8 +89,7 @@ def first_at(cells: Cells, psnr: float) -> str:
 
 
 def whole_run(cells: Cells) -> str:
-    seconds, psnr = duration(mean(cells, "seconds")), f"{mean(cells, 'psnr'):.2f}"
-    text = result(seconds, psnr, mean(cells, "ssim"), mean(cells, "gaussians"))
+    text = result(cells, f"{mean(cells, 'psnr'):.2f}")
     return f"{text}; best on the way {best_psnr(cells):.2f} dB ({len(cells)})"
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from PIL import Image
-from studies import LAB, ROWS, Cells, duration, place, read_json, study_cells, table
+from studies import LAB, ROWS, Cells, counted, duration, place, read_json, study_cells, table
 
 CAPTURES = ("fox", "caliterra", "snowmiku", "bonsai", "train")
 PICTURE = LAB / "headline.png"
@@ -29,7 +29,7 @@ MEASURES: dict[str, tuple[str, Callable[[float], str]]] = {
     "ssim": ("SSIM", lambda value: f"{value:.3f}".lstrip("0")),
     "seconds": ("train s", duration),
     "wall_seconds": ("command s", duration),
-    "gaussians": ("Gaussians", lambda value: f"{value / 1e6:.2f}M" if value >= 1e6 else f"{value / 1e3:.0f}k"),
+    "gaussians": ("Gaussians", counted),
     "megabytes": ("MB", "{:.0f}".format),
     "peak_gib": ("GiB", "{:.1f}".format),
     "fps": ("FPS", "{:.0f}".format),

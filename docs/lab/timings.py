@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from studies import LAB, read_json, table, where
+
+Marks = list[dict[str, float]]
+"""Evaluations of a run of gsplat's trainer: step, seconds of training, PSNR, SSIM, Gaussians."""
 
 
 def wall() -> str:
@@ -36,17 +40,17 @@ def on(record: dict[str, Any], made: str) -> str:
     return f"{where(record)}; {record['scene']}, {'x'.join(map(str, record['image_size']))}.\n\n{made}"
 
 
-def steps(name: str) -> str:
-    """Milliseconds of an iteration [10 %, 90 %], and of its steps [floor], from a file of `turbogs bench step`."""
-    lines = []
-    for entry in read_json(name)["passes"]:
+def steps() -> str:
+    """Milliseconds of an iteration [10 %, 90 %], and of its steps [floor]."""
+    record, lines = read_json("step-h200.json"), []
+    for entry in record["passes"]:
         whole, parts, floors = entry["free_running"], entry["steps"], entry["floors_ms"]
         texts = (f"{parts[step]['device']['median_ms']:.3f} [{floors[step]:.3f}]" for step in STEPS)
         spread = f"{whole['median_ms']:.2f} [{whole['p10_ms']:.2f}, {whole['p90_ms']:.2f}]"
         density = f"{entry['density_event']['wall']['median_ms']:.1f}"
         lines.append((f"{entry['gaussians'] // 1000}k", entry["views"], spread, *texts, density))
     head = ("Gaussians", "K", "whole", *STEPS.values(), "an event of density control")
-    return on(read_json(name), table(head, lines))
+    return on(record, table(head, lines))
 
 
 def raster() -> str:
@@ -118,20 +122,28 @@ SWAPS = {
 }
 
 
+PASSED = (7000, 30000)
+"""Steps of stock whose result the whole step is to pass; the last is the length of stock's run."""
+
+
+def by_length(record: dict[str, Any]) -> dict[tuple[str, str, float], list[Marks]]:
+    """(Capture, variant, steps of a run) -> its seeds."""
+    runs: dict[tuple[str, str, float], list[Marks]] = {}
+    for run in record["runs"]:
+        runs.setdefault((run["scene"], run["variant"], run["marks"][-1]["step"]), []).append(run["marks"])
+    return runs
+
+
 def dropin() -> str:
-    """Variants of examples/simple_trainer/compare.py, means over seeds; and beside stock at the earlier end."""
+    """Variants of examples/simple_trainer/compare.py, means over seeds, and what they have beside stock."""
     parts = []
     for record in sorted((read_json(file.name) for file in LAB.glob("dropin*.json")), key=lambda of: of["date"]):
-        runs: dict[tuple[str, str, float], list[list[dict[str, float]]]] = {}
-        for run in record["runs"]:
-            runs.setdefault((run["scene"], run["variant"], run["marks"][-1]["step"]), []).append(run["marks"])
-        lines, stocks = [], {scene: seeds for (scene, variant, _), seeds in runs.items() if variant == "stock"}
+        runs, lines = by_length(record), []
+        stocks = {scene: seeds for (scene, variant, _), seeds in runs.items() if variant == "stock"}
         for (scene, variant, _), seeds in runs.items():
             end, beside = {name: statistics.fmean(marks[-1][name] for marks in seeds) for name in seeds[0][-1]}, ""
-            if variant != "stock" and (stock := stocks.get(scene)):
-                seconds = min(end["seconds"], stock[0][-1]["seconds"])
-                ours, theirs = (statistics.fmean(psnr_at(marks, seconds) for marks in of) for of in (seeds, stock))
-                beside = f"{ours - theirs:+.2f} dB: {ours:.2f} for {theirs:.2f} at {seconds:.0f} s"
+            if variant not in ("stock", "step") and (stock := stocks.get(scene)):
+                beside = at_equal_time(stock, seeds)
             texts = (f"{end[name]:.{digits}f}" for name, digits in (("seconds", 1), ("psnr", 2), ("ssim", 4)))
             texts = (f"{end['step']:.0f}", *texts, f"{end['gaussians'] / 1e3:.0f}k")
             lines.append((scene, f"{SWAPS.get(variant, variant)} ({len(seeds)})", *texts, beside))
@@ -140,9 +152,39 @@ def dropin() -> str:
     return "\n\n".join(parts)
 
 
-def psnr_at(marks: Sequence[dict[str, float]], seconds: float) -> float:
-    """PSNR after these seconds of training, on the straight line between evaluations."""
-    return float(np.interp(seconds, *([mark[key] for mark in marks] for key in ("seconds", "psnr"))))
+def at_equal_time(stock: Sequence[Marks], ours: Sequence[Marks]) -> str:
+    """PSNR of both when the first of them has ended, on straight lines between evaluations."""
+    seconds = min(of[0][-1]["seconds"] for of in (stock, ours))
+    curves = ([[[mark[key] for mark in marks] for key in ("seconds", "psnr")] for marks in of] for of in (stock, ours))
+    theirs, own = (statistics.fmean(float(np.interp(seconds, *curve)) for curve in of) for of in curves)
+    return f"{own - theirs:+.2f} dB: {own:.2f} for {theirs:.2f} at {seconds:.0f} s"
+
+
+def sooner(stock: Sequence[Marks], ours: Sequence[Marks], step: float) -> tuple[float, float]:
+    """The fewest and the most times sooner that our runs pass PSNR and SSIM of stock's runs at a step; 0: never."""
+    ends, times = [mark for marks in stock for mark in marks if mark["step"] == step], []
+    for end, marks in itertools.product(ends, ours):
+        past = (mark["seconds"] for mark in marks if mark["psnr"] >= end["psnr"] and mark["ssim"] >= end["ssim"])
+        times.append(end["seconds"] / next(past, np.inf))
+    return min(times), max(times)
+
+
+def whole_step() -> str:
+    """How much sooner the whole step passes stock's results, by the length of its run that does so soonest."""
+    runs, rows = by_length(read_json("dropin-step.json")), []
+    captures = dict.fromkeys(scene for scene, *_ in runs)
+    for step in PASSED:
+        cells = [step]
+        for capture in captures:
+            found = {
+                of[2]: sooner(runs[capture, "stock", PASSED[-1]], runs[of], step)
+                for of in runs
+                if of[:2] == (capture, "step")
+            }
+            length, (low, high) = max(found.items(), key=lambda of: of[1])
+            cells.append(f"{low:.0f} to {high:.0f} times, by {length} steps")
+        rows.append(cells)
+    return table(("stock's steps", *captures), rows)
 
 
 def pixels_on_an_mlp() -> str:
