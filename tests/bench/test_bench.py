@@ -7,16 +7,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers.framework_runs import assert_identical, tiny_config
+from helpers.framework_runs import assert_identical, tiny_trainer
 from helpers.simulated_time import OperatorTime, SimulatedTime
 from helpers.synthetic_capture import surface_gaussians
 
 from turbogs_plugin.bench import floors
 from turbogs_plugin.bench.timing import BLOCKS, STEPS, Mark, Recorder, back_to_back, measure, recorded, summary
 from turbogs_plugin.bench.workloads import resized
-from turbogs_plugin.captures.load import load_scene
 from turbogs_plugin.model.ply import save_ply
-from turbogs_plugin.train.trainer import Trainer
 
 CPU = torch.device("cpu")
 
@@ -41,10 +39,8 @@ def test_clocks_measure_what_passes(monkeypatch):
 
 
 def test_the_recorder_marks_the_trainers_own_steps_and_leaves_no_trace(capture, monkeypatch):
-    config, recorder, operators = tiny_config(capture).without_plan(), Recorder(CPU), OperatorTime(monkeypatch)
-    plain, watched = (Trainer(config, load_scene(capture), CPU) for _ in range(2))
-    for trainer in (plain, watched):
-        trainer.initialise_maps()
+    recorder, operators = Recorder(CPU), OperatorTime(monkeypatch)
+    plain, watched = (tiny_trainer(capture) for _ in range(2))
     with operators, recorded(watched, recorder) as iteration:
         for _ in range(2):
             iteration()

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.framework_runs import assert_identical, tiny_capture, tiny_settings
+from helpers.framework_runs import assert_identical, tiny_capture, tiny_trainer
 from helpers.models import random_gaussians
 from helpers.peer_files import KeepingEngine, PeerFiles
 from helpers.processes import ended, grouped, said, start_ranks
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed import in_place, peer_memory, ranks_engine
 from turbogs_plugin.distributed.in_place import DRAWN, STEPPED, WRITTEN, InPlace
 from turbogs_plugin.distributed.messages import rows_of
@@ -52,10 +51,7 @@ def trainer_of(
 ) -> Trainer:
     """With memory of these files, and an engine that keeps passes there."""
     engine = RanksEngine(engine or KeepingEngine(), ranks, CPU, files)
-    config = load_config("turbogs", [*tiny_settings(*overrides), "train.device=cpu", *overrides]).without_plan()
-    trainer = Trainer(config, scene_of(capture), CPU, engine=engine)
-    trainer.initialise_maps()
-    return trainer
+    return tiny_trainer(scene_of(capture), *overrides, engine=engine)
 
 
 def run(trainer: Trainer, way: bool | None = True) -> dict:

@@ -12,19 +12,17 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import tiny_capture, tiny_settings
+from helpers.framework_runs import tiny_capture, tiny_trainer
 from helpers.models import random_gaussians
 from helpers.processes import ended, grouped, said, start_ranks
 from PIL import Image
 from torch import Tensor
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.distributed import ranks_engine
 from turbogs_plugin.distributed.messages import rows_of
 from turbogs_plugin.distributed.ranks import ONE, ProcessRanks, Ranks
 from turbogs_plugin.distributed.ranks_engine import RanksEngine
-from turbogs_plugin.engine import Engine
 from turbogs_plugin.engine.moments import GaussianMoments
 from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.model.torch_file import leaves
@@ -74,11 +72,8 @@ def case_of(capture: Path, name: str, ranks: Ranks = ONE) -> Trainer:
     return trainer_of(place, *CASES[name], ranks=ranks)
 
 
-def trainer_of(capture: Path, *overrides: str, ranks: Ranks = ONE, engine: Engine | None = None) -> Trainer:
-    config = load_config("turbogs", [*tiny_settings(*overrides), "train.device=cpu", *overrides])
-    config.scene.path = str(capture)
-    engine = ranks.engine(CPU) if engine is None else engine
-    return Trainer(config.without_plan(), scene_of(capture), CPU, engine=engine)
+def trainer_of(capture: Path, *overrides: str, ranks: Ranks = ONE) -> Trainer:
+    return tiny_trainer(scene_of(capture), *overrides, engine=ranks.engine(CPU))
 
 
 def state_of(trainer: Trainer) -> dict:
@@ -110,7 +105,6 @@ def every_case(capture: Path, out: Path, cases: tuple[str, ...]) -> None:
     for name in cases:
         ranks_engine.OWNERS_FROM = usual if name == "all records" else 0  # small models have no owners by themselves
         trainer = case_of(capture, name, ranks)
-        trainer.initialise_maps()
         trainer.complete()
         trainer.step()
         trainer.complete()
@@ -127,7 +121,6 @@ def broken_ranks(capture: Path, ranks: ProcessRanks) -> dict:
     """What not-finite values in one process do to all."""
     last, found = ranks.count - 1, {}
     trainer = trainer_of(capture, "schedule.min_views=4", "schedule.max_views=4", ranks=ranks)
-    trainer.initialise_maps()
     engine = trainer.engine.engine
     render = engine.render
 
@@ -192,7 +185,6 @@ def alone(capture) -> dict:
     results = {}
     for name in CASES:
         trainer = case_of(capture, name)
-        trainer.initialise_maps()
         trainer.step()
         results[name] = state_of(trainer)
         for _ in range(3 if name in WITH_EVENTS else 0):

@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.framework_runs import tiny_trainer
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
-from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine import ReferenceEngine
 from turbogs_plugin.engine.reference.losses import depth_loss
 from turbogs_plugin.engine.render import dense_samples
@@ -18,7 +17,6 @@ from turbogs_plugin.engine.rules import LossTerms
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.depths import CELL, DepthPair, InverseDepths
 from turbogs_plugin.strategies.losses import EPSILON, CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
-from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import PARAMETER_NAMES
 from turbogs_plugin.types.cameras import Observations
 
@@ -131,15 +129,12 @@ def test_every_loss_owns_the_weight(loss):
         loss(depth_weight=-1.0)
 
 
-def test_training_with_the_term_brings_depths_nearer(tmp_path):
+def test_training_with_the_term_brings_depths_nearer(scene):
     """Against the same steps without it, at the pixels of the capture's points."""
-    capture = tiny_capture(tmp_path)
-    scene, errors = load_scene(capture), []
+    errors = []
     known = InverseDepths.of(scene.train.cameras, scene.train.observations, scene.points)
     for weight in (0.0, 1.0):
-        config = tiny_config(capture, f"loss.depth_weight={weight}", "train.dropout=0").without_plan()
-        trainer = Trainer(config, scene, torch.device("cpu"))
-        trainer.initialise_maps()
+        trainer = tiny_trainer(scene, f"loss.depth_weight={weight}", "train.dropout=0")
         for _ in range(10):
             trainer.step()
         samples = dense_samples(trainer.views.cameras)

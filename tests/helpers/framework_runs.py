@@ -13,6 +13,7 @@ import torch
 from turbogs_plugin.captures import load_scene, write_demo_capture
 from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.config.configuration import Config, load_config
+from turbogs_plugin.engine import Engine
 from turbogs_plugin.scene import Scene
 from turbogs_plugin.train.trainer import Trainer
 
@@ -26,10 +27,6 @@ TINY = (
 
 ENDLESS = ("train.iterations=100000", "train.refine_until=9", "train.checkpoint_every=3", "train.evaluate_at=[]")
 """After `TINY`: a run that no test waits for."""
-
-
-def tiny_settings(*overrides: str) -> list[str]:
-    return without_replaced(TINY, overrides)
 
 
 def without_replaced(settings: Sequence[str], overrides: Sequence[str]) -> list[str]:
@@ -62,16 +59,17 @@ def thin_out_points(capture: Path, every: int) -> Path:
 
 
 def tiny_config(capture: Path | str, *overrides: str) -> Config:
-    """14 iterations with three densifications, two final prunings and three SH degrees."""
-    config = load_config("turbogs", [*TINY, "train.device=cpu", *overrides])
+    """14 iterations with three densifications, two final prunings and three SH degrees; an override may change the type
+    of a strategy."""
+    config = load_config("turbogs", [*without_replaced(TINY, overrides), "train.device=cpu", *overrides])
     config.scene.path = str(capture)
     return config
 
 
-def tiny_trainer(scene: Scene | Path, *overrides: str) -> Trainer:
+def tiny_trainer(scene: Scene | Path, *overrides: str, engine: Engine | None = None) -> Trainer:
     """A trainer on the CPU, on a scene or a capture, with its first maps."""
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
-    trainer = Trainer(tiny_config("capture", *overrides).without_plan(), scene, torch.device("cpu"))
+    trainer = Trainer(tiny_config("capture", *overrides).without_plan(), scene, torch.device("cpu"), engine=engine)
     trainer.initialise_maps()
     return trainer
 

@@ -3,45 +3,32 @@
 import json
 import random
 from collections import deque
-from pathlib import Path
 from threading import Event
 
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import assert_identical, tiny_config
+from helpers.framework_runs import assert_identical, tiny_config, tiny_trainer
 
-from turbogs_plugin.captures import load_scene
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.export.renders import render_run
 from turbogs_plugin.report.evaluation import evaluate_run
-from turbogs_plugin.scene import Scene, offload
+from turbogs_plugin.scene import offload
 from turbogs_plugin.scene.offload import ABSENT, OffloadedErrorMaps, ViewWindow
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.train import run
-from turbogs_plugin.train.trainer import Trainer
 from turbogs_plugin.types import Step
 
 SIZES = np.array([[21, 17], [5, 40], [16, 16], [1, 1], [33, 9], [20, 20], [7, 7]])
 CPU = torch.device("cpu")
-
-
-@pytest.fixture(scope="module")
-def scene(capture) -> Scene:
-    return load_scene(capture)
-
-
-def trainer_of(scene: Scene, capture: Path, place: str, *overrides: str) -> Trainer:
-    return Trainer(tiny_config(capture, f"train.pixels_place={place}", *overrides).without_plan(), scene, CPU)
+PLACES = ("device", "host")
 
 
 @pytest.mark.parametrize("unit", ["pixel", "tile"])
-def test_training_is_bit_for_bit_that_of_resident_maps_and_photos(scene, capture, unit):
+def test_training_is_bit_for_bit_that_of_resident_maps_and_photos(scene, unit):
     overrides = (f"pixel_sampler.unit={unit}", "schedule.max_views=2")
-    resident, offloaded = (trainer_of(scene, capture, place, *overrides) for place in ("device", "host"))
-    for trainer in (resident, offloaded):
-        trainer.initialise_maps()
+    resident, offloaded = (tiny_trainer(scene, f"train.pixels_place={place}", *overrides) for place in PLACES)
     assert_identical(resident.state_dict(), offloaded.state_dict())
     for _ in range(9):
         resident.step()
@@ -54,23 +41,7 @@ def test_training_is_bit_for_bit_that_of_resident_maps_and_photos(scene, capture
     assert len(offloaded.maps.errors) == len(offloaded.views.photos.colors)  # both, and checks that
 
 
-def test_a_run_stops_with_resident_maps_and_goes_on_with_offloaded_ones(scene, capture):
-    whole, first, second = (trainer_of(scene, capture, place) for place in ("device", "device", "host"))
-    for trainer in (whole, first):
-        trainer.initialise_maps()
-    for _ in range(6):
-        whole.step()
-        first.step()
-    second.load_state_dict(first.state_dict())
-    for iteration in range(6):
-        whole.step()
-        second.step()
-        if iteration == 2:
-            second.state_dict()  # a checkpoint in between changes nothing
-    assert_identical(whole.state_dict(), second.state_dict())
-
-
-@pytest.mark.parametrize("place", ["device", "host"])
+@pytest.mark.parametrize("place", PLACES)
 def test_photos_stay_in_host_memory_when_a_run_is_looked_at(capture, tmp_path, monkeypatch, place):
     """Evaluated, where it was planned so, with the same errors; rendered, always."""
     config = tiny_config(capture, f"train.pixels_place={place}", "train.iterations=2")

@@ -11,12 +11,12 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import TINY, without_replaced
+from helpers.framework_runs import tiny_config, without_replaced
 from helpers.tolerances import PSNR_BOUND
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.config.configuration import Config, load_config
+from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
@@ -48,18 +48,16 @@ def saved_model(folder: Path) -> dict[str, torch.Tensor]:
 
 
 SHORT = (
-    *("train.iterations=9", "train.refine_until=7", "train.sh_interval=2", "train.device=cpu"),
+    *("train.iterations=9", "train.refine_until=7", "train.sh_interval=2"),
     *("density.refine_from=1", "density.refine_every=2", "density.final_every=1", "density.max_gaussians=600"),
 )
-"""On top of `TINY`: as many events and degrees in fewer iterations."""
+"""On top of `tiny_config`: as many events and degrees in fewer iterations."""
 
 
 def small_config(capture: Path, *overrides: str) -> Config:
     """9 iterations with three densifications, a final pruning and three SH degrees; an override may change the type of
     a strategy."""
-    config = load_config("turbogs", [*without_replaced([*TINY, *SHORT], overrides), *overrides])
-    config.scene.path = str(capture)
-    return config
+    return tiny_config(capture, *without_replaced(SHORT, overrides), *overrides)
 
 
 def train_to_the_end(capture: Path, out: Path, *overrides: str, report: Report | None = None) -> run.RunSession:

@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import assert_identical, stop_after, tiny_config, tiny_settings, tiny_trainer
+from helpers.framework_runs import assert_identical, stop_after, tiny_config, tiny_trainer
 from helpers.optimizers import make_gaussians
 from helpers.processes import ended, said, start_ranks
 from PIL import Image
@@ -317,9 +317,7 @@ def test_what_stands_before_a_camera_goes_with_the_next_change(capture, clears, 
     ids=lambda overrides: overrides[0],
 )
 def test_every_alternative_trains(capture, tmp_path, overrides):
-    config = load_config("turbogs", [*tiny_settings(*overrides), "train.device=cpu", "train.iterations=5", *overrides])
-    config.scene.path = str(capture)
-    outcome = run.train(config, tmp_path / "run")
+    outcome = run.train(tiny_config(capture, "train.iterations=5", *overrides), tmp_path / "run")
     assert outcome.history[-1].psnr > outcome.history[0].psnr
 
 
