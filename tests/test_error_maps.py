@@ -4,18 +4,15 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import assert_identical
+from helpers.sampling_cases import step
 
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
 from turbogs_plugin.tiles import dense_pixels
-from turbogs_plugin.types import PixelSamples, Step
+from turbogs_plugin.types import PixelSamples
 
 SIZES = np.array([[21, 17], [5, 40], [16, 16]])
-
-
-def step(iteration):
-    return Step(iteration=iteration, total=10**6, refine_until=10**6)
 
 
 def one_tile(pixel_ids, size=(16, 16), view_id=0):

@@ -2,28 +2,12 @@
 
 import pytest
 import torch
+from helpers.raster_extremes import render_and_check
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.engine.render import dense_samples, rasterize
-from turbogs_plugin.types import Gaussians, GaussianStats
 
 NAN, INFINITY = float("nan"), float("inf")
-
-
-def render_and_check(gaussians: Gaussians, cameras):
-    """Render and go back with every gradient and statistic; all finite."""
-    samples = dense_samples(cameras)
-    rendered = rasterize(gaussians, cameras, samples, with_depth=True)
-    stats = GaussianStats.zeros(len(gaussians), "cpu")
-    ones = torch.ones_like(rendered.alphas)
-    screen = rendered.backward(
-        torch.ones_like(rendered.colors), ones, with_statistics=True, alpha_gradients=ones, depth_gradients=ones
-    )
-    gradients = screen.parameter_gradients(rows=True, stats=stats)
-    for value in (rendered.colors, rendered.alphas, rendered.depths, *vars(gradients).values(), *vars(stats).values()):
-        assert value.isfinite().all()
-    assert (rendered.alphas >= 0).all() and (rendered.alphas <= 1 + 1e-6).all()
-    return rendered, gradients
 
 
 @pytest.mark.parametrize("scales", [20.0, [20.0, -20.0, 0.0], None], ids=["huge", "mixed", "transparent"])

@@ -50,13 +50,15 @@ def test_a_pass_that_drew_nothing_teaches_nothing(case, monkeypatch, factor, ove
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf])
 @pytest.mark.parametrize("loss", [CharbonnierLoss(), CharbonnierNccLoss(), SparseSsimLoss()])
 def test_a_colour_that_is_not_finite_leaves_its_pixel_alone(case, loss, bad):
-    """Neither its error nor its age changes, as in the kernels; all other pixels learn as if it were not there."""
+    """Neither its error nor its age changes, as in the kernels; all other pixels learn as if it were not there; loss
+    and gradients stay finite."""
     maps, truth = case
     before = maps.state_dict()
     slots = torch.tensor([0, 5, 100])
     colors = torch.full((256, 3), 0.5)
     colors[slots, 1] = bad
     output = engine_of(colors.device).supervise(loss.terms, colors, truth, MapUpdate(maps, STEP))
+    assert output.loss.isfinite() and output.color_gradients.isfinite().all()
     assert not output.pixel_errors[slots].any() and not output.color_gradients[slots].any()
     flat = truth.samples.flat_pixels(maps.offsets)
     kept = torch.zeros(len(maps.errors), dtype=torch.bool)

@@ -7,13 +7,13 @@ import pytest
 import torch
 from helpers.framework_runs import tiny_capture, tiny_config
 from helpers.raster_cases import FORWARD_BOUND, GPU_ONLY, GRADIENT_BOUND
-from helpers.raster_extremes import CASES, NAMES, TWO_VIEWS, assert_within, compare, random_scene
+from helpers.raster_extremes import CASES, TWO_VIEWS, assert_within, compare, random_scene
 from helpers.tolerances import TOLERANCES, Tolerance
 
 from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.train.run import train
 from turbogs_plugin.train.saved_model import load_model
-from turbogs_plugin.types import GaussianStats
+from turbogs_plugin.types import PARAMETER_NAMES, GaussianStats
 
 pytestmark = GPU_ONLY
 
@@ -47,7 +47,7 @@ def test_any_gaussian_among_ordinary_ones_stays_finite(size):
         case = f"at {place}, quaternion of length {norm}"
         assert rendered.colors.isfinite().all() and rendered.alphas.isfinite().all(), case
         assert all(value.isfinite().all() for value in (*vars(gradients).values(), *vars(stats).values())), case
-        for name in NAMES[:-1]:
+        for name in PARAMETER_NAMES[:-1]:
             assert (getattr(gradients, name)[:, ~gradients.touched] == 0).all(), f"{name}, {case}"
 
 

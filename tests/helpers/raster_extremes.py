@@ -10,9 +10,8 @@ from helpers.rendering_scenes import make_cameras, make_gaussians
 from helpers.tolerances import Tolerance
 
 from turbogs_plugin.engine.render import dense_samples, rasterize
-from turbogs_plugin.types import Cameras, GaussianGradients, Gaussians
-
-NAMES = ("means", "quats", "scales", "opacities", "sh0", "shN")
+from turbogs_plugin.engine.render_pass import Rendered
+from turbogs_plugin.types import PARAMETER_NAMES, Cameras, GaussianGradients, Gaussians, GaussianStats
 
 
 def lens(degrees: float, size: tuple[int, int], center: float | None = None) -> Cameras:
@@ -94,6 +93,22 @@ def render(
     return rendered.colors.double().cpu(), GaussianGradients(**values)
 
 
+def render_and_check(gaussians: Gaussians, cameras: Cameras) -> tuple[Rendered, GaussianGradients]:
+    """Render and go back with every gradient and statistic; all finite."""
+    samples = dense_samples(cameras)
+    rendered = rasterize(gaussians, cameras, samples, with_depth=True)
+    stats = GaussianStats.zeros(len(gaussians), "cpu")
+    ones = torch.ones_like(rendered.alphas)
+    screen = rendered.backward(
+        torch.ones_like(rendered.colors), ones, with_statistics=True, alpha_gradients=ones, depth_gradients=ones
+    )
+    gradients = screen.parameter_gradients(rows=True, stats=stats)
+    for value in (rendered.colors, rendered.alphas, rendered.depths, *vars(gradients).values(), *vars(stats).values()):
+        assert value.isfinite().all()
+    assert (rendered.alphas >= 0).all() and (rendered.alphas <= 1 + 1e-6).all()
+    return rendered, gradients
+
+
 def compare(case: str, dtype: torch.dtype, device: str) -> tuple[float, dict[str, float]]:
     """Errors of a case against float64 on the CPU: the largest of a sample's colour, over the largest colour, and of
     every parameter's gradient, L2 over L2. Fails where anything is not finite."""
@@ -102,7 +117,7 @@ def compare(case: str, dtype: torch.dtype, device: str) -> tuple[float, dict[str
     assert case == "image of one pixel" or expected.max() > 0.02
     error = float((colors - expected).abs().max() / expected.abs().max().clamp(min=1.0))
     errors = {}
-    for name in NAMES:
+    for name in PARAMETER_NAMES:
         got, wanted = getattr(gradients, name), getattr(expected_gradients, name)
         assert got.isfinite().all()
         if name == "quats" and case in WITHOUT_DIRECTION:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.optimizers import all_finite, make_gaussians
+from helpers.optimizers import all_finite, busy_stats, controlled, make_gaussians
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.types import Step
 
 EVENT = Step(iteration=200, total=5000, refine_until=3500, seed=7, scene_extent=1.0)
@@ -23,10 +22,7 @@ def test_what_is_too_large_to_split_goes(split, log_scale):
     """exp(88) is finite in float32 and ten times that is not: no split may make a model that is lost."""
     gaussians = make_gaussians(200, dtype=torch.float32)
     gaussians.scales[::2] = log_scale
-    density = ErrorDrivenDensity(refine_from=200, top_fraction=1.0, split=split)
-    density.setup(gaussians)
-    for name in ("error_sums", "weight_sums", "grad_sums", "view_counts"):
-        getattr(density.stats, name).fill_(1.0)
+    density = controlled(gaussians, busy_stats(200), refine_from=200, top_fraction=1.0, split=split)
     result = density.update(gaussians, EVENT).apply(gaussians)
     assert all_finite(result) and len(result) == (400 if log_scale == 40 else 200)
 
@@ -48,8 +44,7 @@ def test_any_window_and_any_model_end_in_a_finite_model(sums, orders, parameters
     names = ("means", "quats", "scales", "opacities", "sh0")
     for row, (name, value) in enumerate(zip(names, parameters, strict=True)):
         getattr(gaussians, name)[row % count] = value
-    density = ErrorDrivenDensity(refine_from=0, split=split, opacity_decay=decay, max_gaussians=cap, **orders)
-    density.setup(gaussians)
+    density = controlled(gaussians, refine_from=0, split=split, opacity_decay=decay, max_gaussians=cap, **orders)
     fields = ("error_sums", "distance_sums", "weight_sums", "grad_sums", "absgrad_sums", "square_sums", "view_counts")
     for row, (name, value) in enumerate(zip(fields, sums, strict=True)):
         getattr(density.stats, name)[row % count] = value

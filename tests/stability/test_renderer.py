@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.raster_extremes import CASES, NAMES, assert_within, compare, lens, random_scene
+from helpers.raster_extremes import CASES, assert_within, compare, lens, random_scene, render_and_check
 from helpers.tolerances import TOLERANCES
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from turbogs_plugin.engine.render import dense_samples, rasterize
-from turbogs_plugin.types import GaussianStats
+from turbogs_plugin.types import PARAMETER_NAMES
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -45,14 +44,6 @@ def test_any_gaussian_among_ordinary_ones_stays_finite(sizes, place, norm, logit
     gaussians.scales[3], gaussians.means[3] = torch.tensor(sizes), torch.tensor(place)
     gaussians.quats[3] *= norm
     gaussians.opacities[3], gaussians.sh0[3] = logit, color
-    cameras = lens(degrees, size, center)
-    samples = dense_samples(cameras)
-    rendered = rasterize(gaussians, cameras, samples, with_depth=True)
-    ones, stats = torch.ones_like(rendered.alphas), GaussianStats.zeros(len(gaussians), "cpu")
-    upstream = {"alpha_gradients": ones, "depth_gradients": ones}
-    screen = rendered.backward(torch.ones_like(rendered.colors), ones, with_statistics=True, **upstream)
-    gradients = screen.parameter_gradients(rows=True, stats=stats)
-    assert all(value.isfinite().all() for value in (rendered.colors, rendered.alphas, rendered.depths))
-    assert all(value.isfinite().all() for value in (*vars(gradients).values(), *vars(stats).values()))
-    for name in NAMES[:-1]:
+    _, gradients = render_and_check(gaussians, lens(degrees, size, center))
+    for name in PARAMETER_NAMES[:-1]:
         assert (getattr(gradients, name)[:, ~gradients.touched] == 0).all(), name

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.optimizers import all_finite
+from helpers.optimizers import all_finite, controlled, fill
 from helpers.squares import EVENT, SQUARES, event, event_at, grown, removed, small_model, spread_squares, window
 
-from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity, _decayed
+from turbogs_plugin.strategies.density.error_driven import _decayed
 from turbogs_plugin.strategies.density.growth import TINY, drawn_by_squares
 from turbogs_plugin.types import Step
 
@@ -185,11 +185,9 @@ def test_ten_thousand_decays_of_the_opacity(decay):
 def test_two_hundred_events_under_a_cap_stay_finite(cap):
     """With decay and splits, of windows in which all pass: never above the cap, never none, every number finite."""
     gaussians = small_model(3)
-    density = ErrorDrivenDensity(**SQUARES, max_gaussians=cap, opacity_decay=0.4, percent_dense=1e-9)
-    density.setup(gaussians)
+    density = controlled(gaussians, **SQUARES, max_gaussians=cap, opacity_decay=0.4, percent_dense=1e-9)
     for number in range(10, 210):
-        for name, value in vars(window(spread_squares(len(gaussians), number))).items():
-            getattr(density.stats, name).copy_(value)
+        fill(density.stats, window(spread_squares(len(gaussians), number)))
         update = density.update(gaussians, event_at(100 * number))
         if update is not None:
             gaussians = update.apply(gaussians)

@@ -1,4 +1,4 @@
-"""Learning rates, sparse Adam, and the state that all optimizers share."""
+"""Learning rates, sparse Adam (beside torch's in test_dense_adam.py), and the state that all optimizers share."""
 
 from __future__ import annotations
 
@@ -38,23 +38,6 @@ def test_first_rates_fall_with_the_length_of_a_run_and_last_ones_and_the_means_d
         factor = factor if total > 1 or fraction != 0.5 else gain
         assert rates.at(step).sh0 == pytest.approx(factor * plain.at(step).sh0)
         assert rates.at(step).means == plain.at(step).means
-
-
-def test_equals_torch_adam():
-    gaussians = make_gaussians(7)
-    rates = LearningRates(batch_scale=1.0)
-    reference = {name: torch.nn.Parameter(value.clone()) for name, value in gaussians.items()}
-    groups = [{"params": [p], "lr": getattr(rates.at(STEP), name)} for name, p in reference.items()]
-    adam = torch.optim.Adam(groups, eps=1e-15)
-    optimizer = ready(SparseAdam(rates), gaussians)
-    for seed in range(20):
-        gradients = make_gradients(3, 7, seed)
-        optimizer.step(gaussians, gradients, STEP)
-        for name, p in reference.items():
-            p.grad = gradients.summed(name)
-        adam.step()
-    for name, value in gaussians.items():
-        torch.testing.assert_close(value, reference[name].data, rtol=1e-12, atol=1e-12)
 
 
 def test_first_step_is_the_rate_in_float32():

@@ -123,5 +123,5 @@ def test_the_mean_begins_anew_where_rows_change_places(scene):
     trainer = tiny_trainer(scene, "train.average_last=1.0")
     trainer.parameter_mean.add(trainer.learnt())
     rows = torch.arange(len(trainer.gaussians)).flip(0)  # as many as before
-    trainer.change_rows(RowUpdate(rows, torch.zeros(len(rows), dtype=torch.bool), {}))
+    trainer.follow(RowUpdate(rows, torch.zeros(len(rows), dtype=torch.bool), {}))
     assert trainer.parameter_mean.count == 0

@@ -103,15 +103,6 @@ def test_training_itself_is_the_same(averaged, capture):
     assert "parameter_mean" not in plain.state_dict()
 
 
-def test_a_change_of_the_set_begins_it_anew(capture):
-    _, kept = trained(capture, "train.iterations=24", "train.average_last=1.0", "density.final_every=10")
-    sizes = {i: len(kept.learnt[i]["means"]) for i in kept.learnt}
-    changed = [i for i in range(2, 25) if sizes[i] != sizes[i - 1]]
-    assert changed[-1] in range(12, 24) and kept.counts[changed[-1]] <= 1
-    last = [i for i in range(changed[-1], 25) if i % AVERAGE_EVERY == 0]
-    assert kept.counts[24] == len(last) > 1
-
-
 def test_a_resume_within_the_mean_gives_the_same_bits(capture, tmp_path, monkeypatch):
     whole = train(tiny_config(capture, *AVERAGED), tmp_path / "whole")
     with monkeypatch.context() as context:
