@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import TINY, stop_after
+from helpers.refusals import assert_one_line
 from PIL import Image
 
 from turbogs_plugin import __version__, captures, cli
@@ -39,14 +40,6 @@ def finished(capture, tmp_path_factory) -> Path:
     return folder
 
 
-def assert_refused(result: tuple[int, str, str], *words: str) -> None:
-    code, out, err = result
-    assert code == 2 and out == ""
-    assert err.startswith("turbogs: error: ") and err.count("\n") == 1 and err.endswith("\n"), err
-    for word in words:
-        assert str(word) in err
-
-
 def tree(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
@@ -67,7 +60,7 @@ def test_photos_of_more_pixels_than_pillow_takes_for_harmless(turbogs, capture, 
     ],
 )
 def test_a_bad_setting_is_refused(turbogs, capture, tmp_path, arguments, words):
-    assert_refused(turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *arguments), *words)
+    assert_one_line(turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *arguments), *words)
     assert not (tmp_path / "run").exists()
 
 
@@ -85,7 +78,7 @@ def test_cuda_asked_for_and_absent(turbogs, capture, finished, tmp_path, monkeyp
         file = stopped / "config.yaml"
         file.write_text(file.read_text().replace("device: cpu", "device: cuda"))
         call = ["train", "--resume", stopped]
-    assert_refused(turbogs(*call), "CUDA", "turbogs doctor", "--device cpu")
+    assert_one_line(turbogs(*call), "CUDA", "turbogs doctor", "--device cpu")
     assert not (tmp_path / "run").exists()
 
 
@@ -104,8 +97,8 @@ def test_an_output_folder_with_other_files_is_left_alone(turbogs, capture, finis
     (tmp_path / "a.b=c").write_text("mine")  # no override, as it follows an option
     before = tree(finished)
     for out in (finished, tmp_path, tmp_path / "a.b=c"):
-        assert_refused(turbogs("train", capture, "--out", out, "--device", "cpu", *QUICK), "not empty", "--resume")
-    assert_refused(turbogs("train", capture, "--out", tmp_path / "a.b=c" / "run", *QUICK), "cannot be made")
+        assert_one_line(turbogs("train", capture, "--out", out, "--device", "cpu", *QUICK), "not empty", "--resume")
+    assert_one_line(turbogs("train", capture, "--out", tmp_path / "a.b=c" / "run", *QUICK), "cannot be made")
     assert tree(tmp_path) == {"a.b=c": b"mine"} and tree(finished) == before
 
 
@@ -115,7 +108,7 @@ def test_an_output_folder_that_cannot_be_made_is_refused_before_anything_is_comp
 ):
     (tmp_path / "dangling").symlink_to("nowhere")
     monkeypatch.setattr(inputs, "load_scene", lambda *_, **__: pytest.fail("the capture was loaded"))
-    assert_refused(turbogs("train", capture, "--out", tmp_path / out, *QUICK), out, "cannot be made", "choose")
+    assert_one_line(turbogs("train", capture, "--out", tmp_path / out, *QUICK), out, "cannot be made", "choose")
     assert [path.name for path in tmp_path.iterdir()] == ["dangling"]
 
 
@@ -124,7 +117,7 @@ def test_what_the_system_refuses_is_one_line(turbogs, tmp_path, monkeypatch):
         raise OSError(28, "No space\x1b[2J left on device")
 
     monkeypatch.setattr(captures, "write_demo_capture", refused)
-    assert_refused(turbogs("demo", tmp_path / "demo"), "the system says: No space?[2J left on device; choose another")
+    assert_one_line(turbogs("demo", tmp_path / "demo"), "the system says: No space?[2J left on device; choose another")
 
 
 @pytest.mark.parametrize("order", ["SCENE train.seed=5 OPTIONS", "SCENE OPTIONS train.seed=5", "OPTIONS SCENE"])
@@ -143,12 +136,12 @@ def test_plan_without_a_capture_lists_the_settings(turbogs, monkeypatch, changes
 
 
 def test_incomplete_and_contradictory_calls(turbogs, capture, tmp_path):
-    assert_refused(turbogs("train", capture), "SCENE and --out")
-    assert_refused(turbogs("train", "train.iterations=2", "--out", tmp_path / "run"), "no such scene")
+    assert_one_line(turbogs("train", capture), "SCENE and --out")
+    assert_one_line(turbogs("train", "train.iterations=2", "--out", tmp_path / "run"), "no such scene")
     for other in ([capture], ["--device", "cpu"]):
-        assert_refused(turbogs("train", *other, "--resume", tmp_path), "nothing else")
+        assert_one_line(turbogs("train", *other, "--resume", tmp_path), "nothing else")
     for words in (["eval"], ["render"], ["export"], ["train", "--resume"]):
-        assert_refused(turbogs(*words, tmp_path), "holds no run")
+        assert_one_line(turbogs(*words, tmp_path), "holds no run")
     assert not list(tmp_path.iterdir())
 
 
@@ -156,7 +149,7 @@ def test_incomplete_and_contradictory_calls(turbogs, capture, tmp_path):
 def test_an_empty_path_is_not_the_current_folder(turbogs, capture, tmp_path, monkeypatch, words):
     monkeypatch.chdir(shutil.copytree(capture, tmp_path / "copy"))
     before = tree(tmp_path)
-    assert_refused(turbogs(*words), "has no value: write one")
+    assert_one_line(turbogs(*words), "has no value: write one")
     assert tree(tmp_path) == before
 
 
@@ -167,14 +160,14 @@ def test_a_viewer_has_a_usual_port(turbogs, capture, tmp_path, monkeypatch, word
 
     monkeypatch.setattr("turbogs_plugin.viewer.server.Page", page)
     call = words.replace("RUN", str(tmp_path / "run")).split()
-    assert_refused(turbogs("train", capture, *QUICK, *call), f"at 127.0.0.1:{port}")
+    assert_one_line(turbogs("train", capture, *QUICK, *call), f"at 127.0.0.1:{port}")
 
 
 def test_a_run_is_no_capture(turbogs, finished, capture, tmp_path):
     said = f"{finished} is a run's folder: give the capture that it was trained on"
-    assert_refused(turbogs("train", finished, "--out", tmp_path / "run", "--device", "cpu", *QUICK), said)
-    assert_refused(turbogs("plan", finished, "--device", "cpu"), said)
-    assert_refused(turbogs("reconstruct", finished, "--out", tmp_path / "cameras"), said)
+    assert_one_line(turbogs("train", finished, "--out", tmp_path / "run", "--device", "cpu", *QUICK), said)
+    assert_one_line(turbogs("plan", finished, "--device", "cpu"), said)
+    assert_one_line(turbogs("reconstruct", finished, "--out", tmp_path / "cameras"), said)
     assert not list(tmp_path.iterdir())
 
 
@@ -183,14 +176,14 @@ def test_a_run_without_or_with_a_broken_checkpoint(turbogs, finished, tmp_path):
     checkpoint = next((broken / "checkpoints").glob("*.pt"))
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
     for verb in ("eval", "export"):
-        assert_refused(turbogs(verb, broken), "cannot be used", checkpoint.name)
+        assert_one_line(turbogs(verb, broken), "cannot be used", checkpoint.name)
     shutil.rmtree(broken / "checkpoints")
     before = tree(broken)
     for verb in ("eval", "render", "export"):
-        assert_refused(turbogs(verb, broken), "has no checkpoint", "--scene")
+        assert_one_line(turbogs(verb, broken), "has no checkpoint", "--scene")
     (broken / "report.md").unlink()
     del before["report.md"]
-    assert_refused(turbogs("train", "--resume", broken), f"'{broken}' is finished", "model.ply")
+    assert_one_line(turbogs("train", "--resume", broken), f"'{broken}' is finished", "model.ply")
     assert tree(broken) == before
 
 
@@ -210,7 +203,7 @@ def test_a_run_whose_capture_moved_goes_on_with_another_path(turbogs, finished, 
     file.write_text(file.read_text().replace(str(capture), str(tmp_path / "gone")))
     (moved / "report.md").unlink()  # so that there is something left to do
     for words in (["eval"], ["render"], ["view"], ["export", "--max-gaussians", 5], ["train", "--resume"]):
-        assert_refused(turbogs(*words, moved), f"{tmp_path / 'gone'} does not exist; '{file}' names it as scene.path")
+        assert_one_line(turbogs(*words, moved), f"{tmp_path / 'gone'} does not exist; '{file}' names it as scene.path")
     file.write_text(file.read_text().replace(str(tmp_path / "gone"), str(capture)))
     assert turbogs("eval", moved)[0] == 0
 
@@ -224,7 +217,7 @@ def test_a_finished_run_is_evaluated_rendered_and_exported(turbogs, finished, tm
     assert code == 0 and len(images) == 7 and Image.open(images[0]).size == (40, 24)
     code, out, _ = turbogs("export", finished, "--format", "ply", "--out", tmp_path / "mine.ply")
     assert code == 0 and (tmp_path / "mine.ply").read_bytes() == (finished / "model.ply").read_bytes()
-    assert_refused(turbogs("export", finished, "--out", tmp_path / "mine.ply"), "exists")
+    assert_one_line(turbogs("export", finished, "--out", tmp_path / "mine.ply"), "exists")
 
 
 def test_depth_images_are_in_the_captures_own_units(turbogs, capture, finished):
@@ -305,7 +298,7 @@ def test_a_run_without_a_report_tells_its_model_and_both_clocks(turbogs, capture
     ],
 )
 def test_words_that_no_command_takes_are_refused_in_a_line(turbogs, words, said):
-    assert_refused(turbogs(*words.split()), said)
+    assert_one_line(turbogs(*words.split()), said)
 
 
 @pytest.mark.parametrize("verb", COMMANDS)

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from helpers.framework_runs import assert_identical, tiny_trainer
+from helpers.refusals import assert_one_line
 from helpers.simulated_time import OperatorTime, SimulatedTime
 from helpers.synthetic_capture import surface_gaussians
 
@@ -120,5 +121,4 @@ def test_bench_raster_says_what_it_measured_on(turbogs, capture, ply, tmp_path):
 )
 def test_bad_calls_are_refused(turbogs, capture, ply, call, word):
     words = call.replace("CAPTURE", str(capture)).replace("PLY", str(ply)).split()
-    code, out, err = turbogs("bench", words[0], "train.device=cpu", *words[1:])
-    assert code == 2 and out == "" and word in err and err.count("\n") == 1, err
+    assert_one_line(turbogs("bench", words[0], "train.device=cpu", *words[1:]), word)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.refusals import assert_one_line
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.captures.colmap import load_pycolmap
@@ -24,12 +25,6 @@ from turbogs_plugin.types import SH_C0, WHITE
 
 FILES = list(EXPORTS)
 LOSSY = ("spz", "spz2", "splat")
-
-
-def refused(result: tuple[int, str, str], *words: object) -> None:
-    code, out, err = result
-    assert code == 2 and out == "" and err.startswith("turbogs: error: ") and err.count("\n") == 1, (code, out, err)
-    assert all(str(word) in err for word in words), err
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -85,8 +80,8 @@ def test_a_run_whose_capture_is_gone_is_exported_unmeasured(turbogs, finished, c
     (moved / "config.yaml").write_text(text.replace(str(capture), str(tmp_path / "gone")))
     code, out, _ = turbogs("export", moved, "--format", "spz")
     assert code == 0 and "not measured" in out and (moved / "model.spz").is_file()
-    refused(turbogs("export", moved, "--format", "html"), "gone")
-    refused(turbogs("export", moved, "--max-gaussians", "5", "--out", tmp_path / "a.ply"), "gone")
+    assert_one_line(turbogs("export", moved, "--format", "html"), "gone")
+    assert_one_line(turbogs("export", moved, "--max-gaussians", "5", "--out", tmp_path / "a.ply"), "gone")
 
 
 def test_pruning_keeps_what_adds_most(model, scene):
@@ -110,7 +105,9 @@ def test_an_export_of_fewer(turbogs, finished, tmp_path):
     before = (finished / "model.ply").read_bytes()
     code, out, err = turbogs("export", finished, "--max-gaussians", "40")
     assert code == 0 and len(load_ply(finished / "export.ply")) == 40, err
-    refused(turbogs("export", finished, "--max-gaussians", "0", "--out", tmp_path / "b.ply"), "--max-gaussians 0")
+    assert_one_line(
+        turbogs("export", finished, "--max-gaussians", "0", "--out", tmp_path / "b.ply"), "--max-gaussians 0"
+    )
     assert (finished / "model.ply").read_bytes() == before
 
 
@@ -118,14 +115,14 @@ def test_bad_input_is_one_line(turbogs, finished, capture, tmp_path):
     points = tmp_path / "points.ply"
     places = "".join(f"property float {axis}\n" for axis in "xyz")
     points.write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{places}end_header\n1 2 3\n")
-    refused(turbogs("export", finished, "--format", "obj"), "--format obj", "ply, pt, spz")
-    refused(turbogs("export", tmp_path, "--format", "spz"), "holds no run")
-    refused(turbogs("export", finished, "--format", "html", "--out", tmp_path / "x.md"), "ends in .html")
+    assert_one_line(turbogs("export", finished, "--format", "obj"), "--format obj", "ply, pt, spz")
+    assert_one_line(turbogs("export", tmp_path, "--format", "spz"), "holds no run")
+    assert_one_line(turbogs("export", finished, "--format", "html", "--out", tmp_path / "x.md"), "ends in .html")
     call = ("export", points, "--scene", capture, "--format", "spz", "--out")
-    refused(turbogs(*call, tmp_path / "a.spz"), "not a 3DGS model")
-    refused(turbogs(*call, points), "exists")
-    refused(turbogs(*call, tmp_path / "absent" / "a.spz"), "absent")
-    refused(turbogs("export", capture, "--cameras"), "--out FOLDER")
+    assert_one_line(turbogs(*call, tmp_path / "a.spz"), "not a 3DGS model")
+    assert_one_line(turbogs(*call, points), "exists")
+    assert_one_line(turbogs(*call, tmp_path / "absent" / "a.spz"), "absent")
+    assert_one_line(turbogs("export", capture, "--cameras"), "--out FOLDER")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["points.ply"]
 
 
@@ -146,7 +143,7 @@ def test_bad_input_is_one_line(turbogs, finished, capture, tmp_path):
 def test_a_film_that_cannot_be_made_is_refused(turbogs, finished, tmp_path, monkeypatch, options, words):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(renders.importlib.util, "find_spec", lambda name: name)
-    refused(turbogs("render", finished, *options), words)
+    assert_one_line(turbogs("render", finished, *options), words)
     assert not list(tmp_path.iterdir())
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.refusals import assert_one_line
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config, resolve
@@ -69,8 +70,8 @@ def test_what_does_not_fit_is_said_with_the_number_that_would(capture, gaussians
 def test_a_cap_that_nobody_would_keep_is_refused(turbogs, tmp_path):
     assert cap_of(load_config("turbogs", ["density.type=gsplat_default"])) == cap_of(load_config("turbogs")) == 0
     options = ["density.type=gsplat_default", "--out", tmp_path / "run", "--max-gaussians", 10]
-    code, _, err = turbogs("train", tmp_path, *options)
-    assert code == 2 and "density.type gsplat_default keeps no cap: its class needs a field max_gaussians" in err
+    said = "density.type gsplat_default keeps no cap: its class needs a field max_gaussians"
+    assert_one_line(turbogs("train", tmp_path, *options), said)
 
 
 def demand(*overrides: str) -> MemoryDemand:

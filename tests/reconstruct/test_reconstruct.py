@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
-from helpers.refusals import assert_refused
+from helpers.refusals import assert_one_line, assert_refused
 from helpers.textured_corner import camera_centers, render_corner, write_photos
 from PIL import Image
 
@@ -266,8 +266,7 @@ def test_commands_say_in_one_line_what_is_lacking(solved, tmp_path, turbogs, mon
         (("plan", photos), "turbogs reconstruct"),
         (("reconstruct", few, "--out", tmp_path / "scene"), "has 1 photos: at least 3 are needed"),
     ):
-        code, out, err = turbogs(*words)
-        assert (code, out) == (2, "") and err.count("\n") == 1 and said in err
+        assert_one_line(turbogs(*words), said)
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 from helpers.framework_runs import TINY, tiny_capture
 from helpers.processes import PRELOADED
+from helpers.refusals import assert_one_line
 from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin.captures.demo import write_demo_capture
@@ -254,7 +255,5 @@ def test_a_cell_has_the_planned_length_and_keeps_a_cap_on_gaussians(tmp_path, mo
 )
 def test_bad_calls_are_refused(turbogs, capture, tmp_path, arguments, words):
     places = {"CAPTURE": capture, "X": tmp_path / "x"}
-    code, out, err = turbogs(*(places.get(argument, argument) for argument in arguments.split()))
-    assert code == 2 and out == "" and err.count("\n") == 1, err
-    assert words in err
+    assert_one_line(turbogs(*(places.get(argument, argument) for argument in arguments.split())), words)
     assert not (tmp_path / "x").exists()

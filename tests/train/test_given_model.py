@@ -12,6 +12,7 @@ import trimesh
 from gsplat import export_splats
 from helpers.framework_runs import assert_identical, tiny_config, tiny_trainer
 from helpers.models import random_gaussians
+from helpers.refusals import assert_one_line
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -251,9 +252,7 @@ def test_what_is_no_model_is_one_line(turbogs, capture, tmp_path, name):
         calls += [("train", capture, "--init", file, "--out", out)]
         calls += [(verb, file, "--scene", capture, "--out", f"{out}.ply") for verb in ("render", "export")]
     for call in calls:
-        code, printed, error = turbogs(*call)
-        assert code == 2 and printed == "" and error.count("\n") == 1, (call[0], error)
-        assert words in error and str(file) in error
+        assert_one_line(turbogs(*call), words, file)
         assert not list(tmp_path.glob("out*"))
 
 

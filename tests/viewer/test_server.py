@@ -20,6 +20,7 @@ import pytest
 import torch
 from helpers.framework_runs import TINY, assert_identical
 from helpers.processes import comes_true, command_line, ended, said, start_ranks
+from helpers.refusals import assert_one_line
 from helpers.viewer_client import ViewerClient
 
 from turbogs_plugin.errors import InputError
@@ -198,8 +199,7 @@ def test_bad_input_is_one_line(turbogs, tmp_path, capture):
             ("view", points, "--factor", "2"): "--scene",
         }
         for command, named in cases.items():
-            code, said, err = turbogs(*command)
-            assert code == 2 and said == "" and err.count("\n") == 1 and named in err, (command, err)
+            assert_one_line(turbogs(*command), named)
     assert not out.exists()
 
 
