@@ -2,10 +2,9 @@
 
 import pytest
 import torch
-from helpers.framework_runs import assert_iterations_wait_for_nothing, tiny_capture
+from helpers.framework_runs import assert_iterations_wait_for_nothing
 from helpers.raster_cases import GPU_ONLY
 
-from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.train.run import train
 from turbogs_plugin.train.trainer import Trainer
@@ -17,16 +16,15 @@ SOON = {"3dgs": OFTEN, "3dgs-as-shipped": OFTEN, "mcmc": (*OFTEN, "density.max_g
 
 
 @pytest.mark.parametrize("name", SOON)
-def test_baselines_train(tmp_path, name):
+def test_baselines_train(capture, tmp_path, name):
     length = ("train.iterations=100", "train.refine_until=30", "train.sh_interval=50", "train.device=cuda")
     config = load_config(name, [*length, "train.evaluate_at=[0.5]", *SOON[name]])
-    config.scene.path = str(tiny_capture(tmp_path))
+    config.scene.path = str(capture)
     outcome = train(config, tmp_path / "run")
     assert outcome.history[-1].psnr > outcome.history[0].psnr
     assert outcome.history[-1].num_gaussians > outcome.history[0].num_gaussians
 
 
-def test_a_baseline_waits_for_nothing_between_events(tmp_path):
-    scene = load_scene(tiny_capture(tmp_path))
+def test_a_baseline_waits_for_nothing_between_events(scene):
     config = load_config("3dgs", ["train.device=cuda", "density.refine_start_iter=1000"])
     assert_iterations_wait_for_nothing(Trainer(config.without_plan(), scene, torch.device("cuda")))

@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import tiny_capture
 from helpers.raster_cases import GPU_ONLY
 from helpers.synthetic_capture import surface_gaussians
 
 from turbogs_plugin.bench.raster import STAGES, bench_raster
 from turbogs_plugin.bench.step import bench_step
-from turbogs_plugin.captures import load_scene
 
 pytestmark = GPU_ONLY
 
@@ -19,13 +17,12 @@ GPU = torch.device("cuda")
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    loaded = load_scene(tiny_capture(tmp_path_factory.mktemp("bench")))
-    return replace(loaded, train=loaded.train.to(GPU), test=loaded.test.to(GPU))
+def on_gpu(scene):
+    return replace(scene, train=scene.train.to(GPU), test=scene.test.to(GPU))
 
 
-def test_steps_on_the_kernels(scene):
-    (entry,) = bench_step(scene, [surface_gaussians(2000, GPU)], (3,), repeats=5)["passes"]
+def test_steps_on_the_kernels(on_gpu):
+    (entry,) = bench_step(on_gpu, [surface_gaussians(2000, GPU)], (3,), repeats=5)["passes"]
     assert {"GVS", "EPS", "FWD", "gather+L+E", "BWD", "solve+update", "EDC"} <= set(entry["steps"])
     assert entry["lost_iterations"] == 0 and entry["counts"]["touched"] > 0
     held = entry["memory_bytes"]
@@ -36,8 +33,8 @@ def test_steps_on_the_kernels(scene):
     assert parts < 1.2 * entry["steps"]["iteration"]["device"]["median_ms"]
 
 
-def test_stages_of_the_rasterizer(scene):
-    report = bench_raster(scene, [surface_gaussians(3000, GPU)], (3,), repeats=5)
+def test_stages_of_the_rasterizer(on_gpu):
+    report = bench_raster(on_gpu, [surface_gaussians(3000, GPU)], (3,), repeats=5)
     assert {entry["density_sums"] for entry in report["passes"]} == {False, True}
     for entry in report["passes"]:
         assert set(entry["stages"]) == set(STAGES.values()) and entry["lost_passes"] == 0

@@ -5,10 +5,9 @@ import copy
 import numpy as np
 import pytest
 import torch
-from helpers.framework_runs import assert_iterations_wait_for_nothing, tiny_capture, tiny_config
+from helpers.framework_runs import assert_iterations_wait_for_nothing, tiny_config
 from helpers.raster_cases import GPU_ONLY
 
-from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.cuda import training as kernels
 from turbogs_plugin.engine.exposures import Exposures, expose, exposure_gradients, step_exposures
 from turbogs_plugin.tiles import dense_pixels
@@ -104,11 +103,6 @@ def test_a_view_whose_gradient_is_not_finite_and_an_overflow_change_nothing():
     kernels.learn_exposures(exposures, colors, gradients, samples, 0.003)
     assert exposures.steps[4] == before.steps[4] and exposures.steps[0] == before.steps[0] + 1
     assert torch.equal(exposures.exp_avg[4], before.exp_avg[4]) and exposures.offsets.isfinite().all()
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return load_scene(tiny_capture(tmp_path_factory.mktemp("exposures")))
 
 
 @pytest.mark.parametrize(("exposure", "place"), [(False, "device"), (True, "device"), (True, "host")])

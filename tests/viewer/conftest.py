@@ -6,9 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 
 import pytest
-from helpers.framework_runs import tiny_capture, tiny_config
+from helpers.framework_runs import tiny_config
 
-from turbogs_plugin.captures import load_scene
 from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS
 from turbogs_plugin.plan import make_plan
 from turbogs_plugin.train.look import Look
@@ -16,18 +15,7 @@ from turbogs_plugin.train.run import new_loop
 from turbogs_plugin.viewer.pictures import CaptureViews, ModelState
 
 
-@pytest.fixture(scope="session")
-def capture(tmp_path_factory):
-    """The folder of a capture: 7 training views and a test view of 48x40 pixels."""
-    return tiny_capture(tmp_path_factory.mktemp("viewer"))
-
-
-@pytest.fixture(scope="session")
-def scene(capture):
-    return load_scene(capture)
-
-
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def new_training(capture, scene):
     """Makes a training of the tiny configuration, with these changes, that has not begun."""
 
@@ -39,7 +27,7 @@ def new_training(capture, scene):
     return new_training
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def unwatched(new_training):
     """The state at the end of a training that nobody watched. Not to be changed."""
     alone = new_training()
@@ -47,7 +35,7 @@ def unwatched(new_training):
     return alone.trainer.state_dict()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def untouched(new_training, scene):
     trainer = new_training().trainer
     trainer.initialise_maps()
