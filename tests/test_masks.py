@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from helpers.sampling_cases import SIZES, UNITS, pixels_by_tile, random_maps, step
+from helpers.sampling_cases import SIZES, UNITS, Foreign, pixels_by_tile, random_maps, step
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
-from turbogs_plugin.tiles import compact, pixel_table
+from turbogs_plugin.tiles import pixel_table
 from turbogs_plugin.types import TILE_SIZE, PixelSamples
 
 ONE_PIXEL, WHOLE, NOTHING = 0, 1, 2
@@ -63,21 +63,6 @@ def test_live_tiles_are_those_with_a_pixel():
         assert np.array_equal(getattr(found, name), getattr(expected, name)), name
     assert len(masks.bits) == 1 + 1 + 4 + 4  # whole tiles share a row; the half plane cuts three tiles, noise one more
     assert masks.rows[masks.offsets[WHOLE]] == 0
-
-
-class Foreign:
-    """A sampler that knows no masks: every third pixel, with weights and empty slots."""
-
-    def __repr__(self) -> str:
-        return "Foreign()"
-
-    def sample(self, maps, view_ids, rate, step):
-        sizes = maps.sizes[list(view_ids)]
-        table = pixel_table(sizes, "cpu")
-        drawn = (table >= 0) & (table % 3 == 0)
-        ids = torch.arange(len(table), dtype=torch.int32)
-        weights = 1.0 + table.clamp(min=0).float()
-        return compact(view_ids, sizes, table, drawn, ids, np.full(len(table), 128), weights)
 
 
 SAMPLERS = [

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.framework_runs import ENDLESS, TINY, assert_identical, tiny_config
+from helpers.framework_runs import ENDLESS, TINY, assert_identical, saved, tiny_config
 from helpers.processes import PRELOADED, comes_true, command_line, ended, said, start_ranks
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
@@ -121,7 +121,7 @@ def test_a_run_goes_on_with_another_number_of_processes(capture, tmp_path):
         later[count], finals[count] = (
             load_checkpoint(folder / f"run/checkpoints/iteration-0000{number}.pt")["trainer"] for number in (13, 14)
         )
-    whole = load_checkpoint(latest_checkpoint(of_two / "checkpoints"))["trainer"]
+    whole = saved(of_two)
     assert_identical(finals[2], whole)
     for count in (1, 4):
         assert len(finals[count]["gaussians"]["means"]) == len(whole["gaussians"]["means"])
@@ -163,7 +163,7 @@ def test_trouble_of_one_process_ends_all_with_its_own_line(trouble, capture, tmp
 def test_a_signal_to_one_process_stops_and_saves_all(capture, tmp_path):
     codes, text = trained(2, tmp_path, capture, "signal", *ENDLESS)
     assert codes == [128 + signal.SIGTERM] * 2, text
-    state = load_checkpoint(latest_checkpoint(tmp_path / "run/checkpoints"))["trainer"]
+    state = saved(tmp_path / "run")
     assert 6 <= state["iteration"] <= 12
 
 

@@ -15,6 +15,7 @@ from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.engine import Engine
 from turbogs_plugin.scene import Scene
+from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.trainer import Trainer
 
 TINY = (
@@ -72,6 +73,11 @@ def tiny_trainer(scene: Scene | Path, *overrides: str, engine: Engine | None = N
     trainer = Trainer(tiny_config("capture", *overrides).without_plan(), scene, torch.device("cpu"), engine=engine)
     trainer.initialise_maps()
     return trainer
+
+
+def saved(run: Path) -> dict:
+    """The state of the trainer in the newest checkpoint of a run's folder."""
+    return load_checkpoint(latest_checkpoint(run / "checkpoints"))["trainer"]
 
 
 def interrupt(trainer: Trainer) -> None:

@@ -6,6 +6,8 @@ import numpy as np
 import torch
 
 from turbogs_plugin.error_maps import ErrorMaps
+from turbogs_plugin.strategies.protocols import PixelSampler
+from turbogs_plugin.tiles import compact, pixel_table
 from turbogs_plugin.types import Step
 
 SIZES = np.array([[37, 21], [16, 16], [1, 1], [50, 3], [64, 48]])
@@ -24,6 +26,21 @@ def random_maps(sizes=SIZES, seed=0):
         maps.initialise(view_id, torch.rand(int(width * height), generator=generator))
     maps.stamps.copy_(torch.randint(-1, 90, maps.stamps.shape, generator=generator))
     return maps
+
+
+class Foreign(PixelSampler):
+    """A sampler that knows no masks: every third pixel, with weights and empty slots."""
+
+    def __repr__(self) -> str:
+        return "Foreign()"
+
+    def sample(self, maps, view_ids, rate, step):
+        sizes = maps.sizes[list(view_ids)]
+        table = pixel_table(sizes, "cpu")
+        drawn = (table >= 0) & ((table + step.iteration) % 3 == 0)
+        ids = torch.arange(len(table), dtype=torch.int32)
+        weights = 1.0 + table.clamp(min=0).float()
+        return compact(view_ids, sizes, table, drawn, ids, np.full(len(table), 128), weights)
 
 
 def pixels_by_tile(samples):

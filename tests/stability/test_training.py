@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import tiny_config, without_replaced
+from helpers.framework_runs import saved, tiny_config, without_replaced
 from helpers.tolerances import PSNR_BOUND
 from PIL import Image
 
@@ -21,7 +21,6 @@ from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.report.run_report import write_report
 from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler
 from turbogs_plugin.train import run
-from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
 from turbogs_plugin.train.session import Report
 from turbogs_plugin.train.trainer import Trainer
 
@@ -43,10 +42,6 @@ def edit_model(capture: Path, change: Callable[[pycolmap.Reconstruction], None])
     reconstruction.write_binary(capture / "sparse/0")
 
 
-def saved_model(folder: Path) -> dict[str, torch.Tensor]:
-    return load_checkpoint(latest_checkpoint(folder / "checkpoints"))["trainer"]["gaussians"]
-
-
 SHORT = (
     *("train.iterations=9", "train.refine_until=7", "train.sh_interval=2"),
     *("density.refine_from=1", "density.refine_every=2", "density.final_every=1", "density.max_gaussians=600"),
@@ -63,7 +58,7 @@ def small_config(capture: Path, *overrides: str) -> Config:
 def train_to_the_end(capture: Path, out: Path, *overrides: str, report: Report | None = None) -> run.RunSession:
     """A run that ends with a finite model and without an event."""
     outcome = run.train(small_config(capture, *overrides), out, report)
-    assert all(value.isfinite().all() for value in saved_model(out).values())
+    assert all(value.isfinite().all() for value in saved(out)["gaussians"].values())
     assert outcome.history[-1].nonfinite_losses == outcome.history[-1].skipped_updates == 0
     assert all(np.isfinite([evaluation.psnr, evaluation.l1]).all() for evaluation in outcome.history)
     assert outcome.folder.report.is_file() is (report is not None) and outcome.folder.model.is_file()

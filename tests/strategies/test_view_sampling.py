@@ -6,6 +6,7 @@ import torch
 from helpers.sampling_cases import successive
 
 from turbogs_plugin.errors import InputError
+from turbogs_plugin.scene.geometry import look_at
 from turbogs_plugin.strategies.view_sampling import GeometryAwareViewSampler, RandomViewSampler, doubted
 from turbogs_plugin.types import Cameras, Step
 
@@ -18,13 +19,9 @@ def step(iteration, seed=0):
 
 def orbit(num_views, radius=1.0):
     """Cameras on a circle that look at its centre."""
-    viewmats = torch.eye(4).repeat(num_views, 1, 1)
-    for view, angle in enumerate(np.linspace(0, 2 * np.pi, num_views, endpoint=False)):
-        forward = torch.tensor([-np.cos(angle), -np.sin(angle), 0.0])
-        right = torch.tensor([np.sin(angle), -np.cos(angle), 0.0])
-        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward]).float()
-        viewmats[view, :3, :3] = rotation
-        viewmats[view, :3, 3] = rotation @ (forward * radius).float()
+    angles = np.linspace(0, 2 * np.pi, num_views, endpoint=False)
+    places = radius * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    viewmats = torch.from_numpy(np.stack([look_at(place, np.zeros(3), np.eye(3)[2]) for place in places])).float()
     return Cameras(viewmats, torch.eye(3).repeat(num_views, 1, 1), np.full((num_views, 2), 16))
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import assert_identical, tiny_capture, tiny_trainer
+from helpers.sampling_cases import Foreign
 from PIL import Image
 
 from turbogs_plugin.engine.render import rasterize, render_image
@@ -14,8 +15,6 @@ from turbogs_plugin.scene.fingerprint import capture_difference, capture_state
 from turbogs_plugin.scene.photos import Photos
 from turbogs_plugin.strategies.losses import CharbonnierLoss
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler
-from turbogs_plugin.strategies.protocols import PixelSampler
-from turbogs_plugin.tiles import compact, pixel_table
 from turbogs_plugin.train.look import Background, Look
 from turbogs_plugin.train.metrics import compare, evaluate, render_view, ssim
 from turbogs_plugin.types import PARAMETER_NAMES, PixelSamples, Step
@@ -50,16 +49,6 @@ def with_other_masked_pixels(scene):
     return replace(scene, train=replace(views, photos=Photos(colors, views.photos.sizes)))
 
 
-class ForeignSampler(PixelSampler):
-    """Every fifth pixel of the views, masked or not."""
-
-    def sample(self, maps, view_ids, rate, step):
-        table = pixel_table(maps.sizes[list(view_ids)], "cpu")
-        drawn = (table >= 0) & ((table + step.iteration) % 5 == 0)
-        ids = torch.arange(len(table), dtype=torch.int32)
-        return compact(view_ids, maps.sizes[list(view_ids)], table, drawn, ids, drawn.sum(dim=1).numpy())
-
-
 class ForeignLoss:
     """A loss in its own code."""
 
@@ -89,7 +78,7 @@ def test_masked_pixels_change_no_bit_of_a_run(scene, overrides):
     for given in (scene, with_other_masked_pixels(scene)):
         trainer = tiny_trainer(given, *(() if overrides == "foreign" else overrides))
         if overrides == "foreign":
-            trainer.pixel_sampler, trainer.loss = ForeignSampler(), ForeignLoss()
+            trainer.pixel_sampler, trainer.loss = Foreign(), ForeignLoss()
         trainer.initialise_maps()
         start = trainer.gaussians.map(torch.clone)
         for _ in range(6):

@@ -59,6 +59,8 @@ def test_it_is_the_mean_of_what_was_added():
     mean.restart()
     mean.add(tensors(5.0, rows=7))
     torch.testing.assert_close(mean.tensors, tensors(5.0, rows=7))
+    mean.add(tensors(8.0, rows=3))  # of other Gaussians, so it begins anew
+    torch.testing.assert_close(mean.tensors, tensors(8.0, rows=3))
 
 
 def test_the_lines_of_the_documentation():

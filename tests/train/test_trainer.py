@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from helpers.framework_runs import assert_identical, stop_after, tiny_config, tiny_trainer
+from helpers.framework_runs import assert_identical, saved, stop_after, tiny_config, tiny_trainer
 from helpers.optimizers import make_gaussians
 from helpers.processes import ended, said, start_ranks
 from PIL import Image
@@ -34,7 +34,7 @@ from turbogs_plugin.strategies.losses import CharbonnierLoss
 from turbogs_plugin.strategies.protocols import SparseLoss
 from turbogs_plugin.strategies.returned import require_rows, require_stats
 from turbogs_plugin.train import run
-from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
+from turbogs_plugin.train.checkpoint import latest_checkpoint
 from turbogs_plugin.train.history import read_history
 from turbogs_plugin.train.inputs import open_scene
 from turbogs_plugin.train.metrics import evaluate
@@ -51,10 +51,6 @@ pytestmark = pytest.mark.usefixtures("plotted")
 def whole(capture, tmp_path_factory) -> run.RunSession:
     """A run never stopped."""
     return run.train(tiny_config(capture), tmp_path_factory.mktemp("runs") / "whole", write_report)
-
-
-def saved(folder: Path) -> dict:
-    return load_checkpoint(latest_checkpoint(folder / "checkpoints"))["trainer"]
 
 
 def test_a_run_leaves_everything_that_it_promises(whole, capture):
@@ -259,15 +255,15 @@ def test_non_finite_losses_are_counted(capture, tmp_path, monkeypatch):
 
 def test_a_capture_made_anew_since_the_run_began_is_refused(capture, whole, tmp_path):
     """Turned by a hundredth, say; two readings of one reconstruction differ by less."""
-    saved, present = (capture_state(load_scene(capture)) for _ in range(2))
+    began, present = (capture_state(load_scene(capture)) for _ in range(2))
     for views in (present["train_views"], present["test_views"]):
         views["viewmats"] += 2e-6
         views["Ks"] *= 1 + 2e-6
-    assert capture_difference(saved, present) == ""
+    assert capture_difference(began, present) == ""
     present["test_views"]["viewmats"][0, 0, 3] += 2e-5
-    assert capture_difference(saved, present) == "other cameras of test images"
-    scaled = saved | {"frame": saved["frame"] | {"scale": 2 * saved["frame"]["scale"]}}
-    assert capture_difference(saved, scaled) == "other coordinates"
+    assert capture_difference(began, present) == "other cameras of test images"
+    scaled = began | {"frame": began["frame"] | {"scale": 2 * began["frame"]["scale"]}}
+    assert capture_difference(began, scaled) == "other coordinates"
 
     run_folder = Path(shutil.copytree(whole.folder.path, tmp_path / "run"))
     config = whole.folder.read_config()
