@@ -17,6 +17,7 @@ import numpy as np
 import torch
 import torch.utils.cpp_extension
 from PIL import Image
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 MODEL_IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
@@ -48,12 +49,11 @@ class Nearest:
         self.count = n_neighbors
 
     def fit(self, points: np.ndarray) -> Nearest:
-        self.points = torch.as_tensor(points, dtype=torch.float64)
+        self.tree = cKDTree(points)
         return self
 
     def kneighbors(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found = torch.cdist(torch.as_tensor(points, dtype=torch.float64), self.points).topk(self.count, largest=False)
-        return found.values.numpy(), found.indices.numpy()
+        return self.tree.query(points, k=self.count)
 
 
 class SceneManager:
