@@ -8,17 +8,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.projects import project_of
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from turbogs_plugin import commands
 from turbogs_plugin.cli import main
 from turbogs_plugin.doctor import COMMAND_PACKAGES, INSTALL_COMMANDS
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # pytest brings it
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -79,7 +75,7 @@ print("used")
 
 @pytest.fixture(scope="module")
 def project() -> dict:
-    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return project_of(ROOT)
 
 
 def requirements(lines: list[str]) -> dict[str, Requirement]:

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tomllib
 import torch
 from helpers.framework_runs import thin_out_points
+from helpers.projects import project_of
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene, write_demo_capture
@@ -110,7 +110,7 @@ def test_baselines(example, thin_capture, tmp_path, capsys):
 @pytest.fixture
 def third_party(tmp_path, monkeypatch):
     """The package as if it were installed: its folder and the metadata that its pyproject.toml stands for."""
-    project = tomllib.loads((PACKAGE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = project_of(PACKAGE)
     metadata = tmp_path / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
     metadata.mkdir()
     named = f"Name: {project['name']}\nVersion: {project['version']}\n"

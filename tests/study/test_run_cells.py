@@ -106,7 +106,8 @@ def test_a_study_is_complete_and_goes_on_where_it_stopped(turbogs, small, captur
     assert {path.name for path in out.iterdir()} == {"cells", "error-over-time.png", "report.md", "results.json"}
     no_training(monkeypatch)
     stamps = [path.stat().st_mtime_ns for path in cells]
-    assert turbogs(*again)[0] == 0 and [path.stat().st_mtime_ns for path in cells] == stamps
+    code, printed, _ = turbogs(*again)
+    assert code == 0 and [path.stat().st_mtime_ns for path in cells] == stamps and "4 of 4 cells" in printed
     shutil.rmtree(out / "cells")
     assert turbogs(*again)[0] == 0, "results.json alone is enough"
     before = (out / "report.md").read_bytes()
@@ -141,12 +142,15 @@ def test_a_cell_that_did_not_end_is_tried_again(
 
 
 def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, study, tmp_path):
-    """Neither is one of another capture of the same name."""
+    """Neither is one of another capture of the same name, nor of an ablation that has its variant no more."""
     before = {path: path.read_bytes() for path in study.rglob("*") if path.is_file()}
     ablate, file, *rest = call(small, capture, study, "--only", "full")
     code, _, err = turbogs(ablate, file, "loss.ncc_weight=0.1", *rest)
     assert code == 2 and "other settings (loss.ncc_weight)" in err
+    small.write_text(SMALL.replace("full", "whole"))
+    assert_one_line(turbogs(*call(small, capture, study)), "capture, full, seed 0", "put its variant back")
     assert {path: path.read_bytes() for path in study.rglob("*") if path.is_file()} == before
+    small.write_text(SMALL)
     other = write_demo_capture(tmp_path / capture.name, views=9, width=48, height=40)
     code, _, err = turbogs(*call(small, other, study, "--only", "full", "--seeds", "1"))
     assert code == 2 and "has other photos than its kept cells" in err
@@ -246,6 +250,7 @@ def test_a_cell_has_the_planned_length_and_keeps_a_cap_on_gaussians(tmp_path, mo
         ("ablate components --scene CAPTURE --out X --seeds 1 1", "seeds"),
         ("ablate components --scene CAPTURE --scene CAPTURE --out X", "are called the same"),
         ("ablate components --scene CAPTURE --out X --gpus 0", "--gpus 0"),
+        ("ablate components train.seed=5 --scene CAPTURE --out X", "train.seed is given by --seeds"),
         ("ablate components budget.time=1s --scene CAPTURE --out X --steps 4", "time budget 1s exclude each other"),
         ("ablate components budget.max_memory=2GiB --scene CAPTURE --out X", "max_memory limits a whole process"),
         ("ablate components --scene CAPTURE --out CAPTURE", "not empty"),

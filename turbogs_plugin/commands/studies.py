@@ -27,7 +27,7 @@ def ablate(
     same call goes on, and several calls may share the folder --out: no cell is trained twice.
 
     Args:
-        name: packaged ablation (parts, components, views, ...) or .yaml file.
+        name: packaged ablation (parts, components, tables, ...) or .yaml file.
         overrides: changes of every variant's configuration; train.device=cpu trains on the CPU.
         out: folder of the study; finished cells in it are kept.
         scene: folder of a capture; may be given several times.

@@ -26,6 +26,9 @@ from turbogs_plugin.yaml_json import read_named_yaml
 PACKAGE = "turbogs_plugin.configs.ablations"
 """Where the packaged ablations are."""
 
+GIVEN = {"train.seed": "--seeds", "scene.path": "--scene"}
+"""Setting -> the option of a study that gives it."""
+
 _NAME = re.compile(r"[A-Za-z0-9+][A-Za-z0-9_+.-]{0,47}")
 
 
@@ -105,7 +108,11 @@ def variant_config(ablation: Ablation, variant: str, seed: int, overrides: Seque
         InputError: the configuration is wrong; the message names the variant.
     """
     try:
-        config = load_config(ablation.base, [*ablation.variants[variant], *overrides, f"train.seed={seed}"])
+        changes = [*ablation.variants[variant], *overrides]
+        for setting in (change.partition("=")[0] for change in changes):
+            if setting in GIVEN:
+                raise InputError(f"{setting} is given by {GIVEN[setting]}: leave it out")
+        config = load_config(ablation.base, [*changes, f"train.seed={seed}"])
         if config.budget.max_memory:
             limits = "budget.max_memory limits a whole process, which here trains all cells"
             raise InputError(f"{limits}: leave it out, or limit density.max_gaussians")

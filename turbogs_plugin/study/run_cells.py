@@ -85,8 +85,10 @@ def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | Non
     folder.require_usable()
     configs = choice.configs(ablation)
     study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
-    _require_same_settings(study, configs)
+    _require_same(study, ablation, configs)
     folder.write_study(Study(ablation, study.results))
+    if there := sum(result.key in configs for result in study.results):
+        print(f"kept    {there} of {len(configs)} cells: these were trained before")
     device = torch.device(next(iter(configs.values())).train.device)
     if gpus is not None and device.type != "cpu" and gpus > torch.cuda.device_count():
         raise InputError(f"--gpus {gpus}: this machine has {torch.cuda.device_count()}; see 'turbogs doctor'")
@@ -140,7 +142,10 @@ def _loaded(settings: tuple[Any, ...], refine: bool) -> tuple[Scene, str, float]
     return scene, capture_digest(scene), time.perf_counter() - started
 
 
-def _require_same_settings(study: Study, configs: dict[CellKey, Config]) -> None:
+def _require_same(study: Study, ablation: Ablation, configs: dict[CellKey, Config]) -> None:
+    """Raise `InputError` where a kept cell's variant is gone, or a cell that is asked for had other settings."""
+    if gone := [str(result.key) for result in study.results if result.variant not in ablation.variants]:
+        raise InputError(f"the study has the cell '{gone[0]}': put its variant back, or choose a new --out")
     for result in (result for result in study.results if result.key in configs):
         asked = flat_settings(configs[result.key].to_mapping())
         changed = [path for path in changes(asked, result.settings) if not path.startswith(OF_A_CALL)]
