@@ -160,6 +160,8 @@ def with_item(**changes: Any) -> list[dict[str, Any]]:
         ({"rates": ("means",)}, "optimizers has no 'means'"),
         ({"max_steps": 0}, "max_steps = 0"),
         ({"scene_scale": -1.0}, "scene_scale = -1.0"),
+        ({"overrides": ("train.exposure=true",)}, "train.exposure is TurboStep's own: .* no exposures; leave it out"),
+        ({"overrides": " scene.factor =2"}, "scene.factor is TurboStep's own: views, .* are the host's"),
     ],
 )
 def test_what_cannot_be_done_is_refused_by_name(arguments, words):
@@ -198,6 +200,9 @@ def test_poses_in_other_axes_are_told_at_the_first_step():
 def test_our_length():
     assert TurboStep.proposed_steps(65) == 3900 and TurboStep.proposed_steps(3) == 2000
     assert TurboStep(make_splats(), make_views()).max_steps == 2000
+    several = TurboStep.proposed_steps(40, overrides=["train.epochs=70"])
+    assert several == TurboStep.proposed_steps(40, overrides="train.epochs=70") != TurboStep.proposed_steps(40)
+    assert_refused("train.seed is TurboStep's own", TurboStep.proposed_steps, 40, overrides="train.seed=1")
 
 
 def test_iterations_that_had_too_little_memory_are_made_again(monkeypatch):

@@ -13,7 +13,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from torch import Tensor
 
-from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
+from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.error_maps import LaggedCopy
 from turbogs_plugin.errors import InputError, require
@@ -44,6 +44,14 @@ from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, LossOutput, RowUpda
 _STEP = "app_opt pose_opt pose_noise with_eval3d antialiased random_bkgd sparse_grad visible_adam opacity_reg scale_reg"
 WITHOUT_EFFECT: dict[str, Any] = {**IN_IMAGES, **dict.fromkeys(_STEP.split(" "), False), "batch_size": 1}
 """Options of gsplat's trainer that change its own step alone, and the value that asks for nothing."""
+_START = "train.init train.init_world train.sh_degree train.initial_opacity train.initial_size train.device"
+_AROUND = "scene train.seed train.refine_cameras train.evaluate_at train.checkpoint_every budget.time"
+OWN_SETTINGS: dict[str, str] = {
+    "train.exposure": "a host's evaluation has no exposures",
+    **dict.fromkeys(_START.split(" "), "splats decide"),
+    **dict.fromkeys(_AROUND.split(" "), "views, torch.manual_seed and all around a step are the host's"),
+}
+"""Settings, or whole sections, that no override can change, and why."""
 LAG = 16
 """Steps after which a loss has reached the host. Trainers show it at every step, and would wait for the GPU there."""
 
@@ -89,10 +97,11 @@ class TurboStep:
         options: the host's, as gsplat's `Config`: those that would have no effect here are refused, and its
             `DefaultStrategy` is laid to rest (refine_stop_iter = 0).
         scene: of gsplat from 1.6 on, a container with more arrays over Gaussians, whose rows follow.
-        config: name of a packaged configuration, or a YAML file. overrides: ``section.key=value`` on top.
+        config: name of a packaged configuration, or a YAML file. overrides: ``section.key=value`` on top, one or
+            several, of any setting but `OWN_SETTINGS`.
 
     Raises:
-        InputError: several processes, an option or a parameter without support, or views of another form.
+        InputError: several processes; an option, override or parameter without support; or views of another form.
     """
 
     def __init__(
@@ -120,14 +129,12 @@ class TurboStep:
             raise InputError(f"strategy {name} would change the Gaussians beside TurboStep: use DefaultStrategy")
         self.splats, self.optimizers, self.scene = splats, {} if optimizers is None else optimizers, scene
         gaussians = self._checked()
-        device, degree = gaussians.device, gaussians.sh_degree
-        images = posed_images(views, white)
-        own = ("train.exposure=false", "train.init=points", f"train.sh_degree={degree}")
-        settings = load_config(config, (*([overrides] if isinstance(overrides, str) else overrides), *own))
+        device, settings = gaussians.device, host_settings(config, overrides)
+        settings.train.sh_degree = gaussians.sh_degree
         if max_steps is not None:
             require(max_steps >= 1, "max_steps", max_steps, "at least 1")
             settings = with_iterations(settings, int(max_steps))
-        world = scene_of(images, gaussians, scene_scale)
+        world = scene_of(posed_images(views, white), gaussians, scene_scale)
         settings = make_plan(settings, world, device).apply(settings)
         settings.train.seed = torch.initial_seed() % 2**31
         self.trainer = HostTrainer(self, settings, world, device)
@@ -146,7 +153,7 @@ class TurboStep:
     def proposed_steps(num_views: int, config: str = DEFAULT_CONFIG, overrides: Sequence[str] = ()) -> int:
         """The length that we propose for this number of training views."""
         facts = SceneFacts(num_views, 0.0, 0, 0, "cpu", 0, 0)
-        return int(wanted_iterations(facts, load_config(config, overrides))[0])
+        return int(wanted_iterations(facts, host_settings(config, overrides))[0])
 
     def step(self, step: int) -> StepInfo:
         """Make the step of this number, `steps`. Raises `InputError` for another, or another number of Gaussians."""
@@ -315,6 +322,15 @@ class HostRates(LearningRates):
     def at(self, step: Step) -> Any:
         rates = {name: float(optimizer.param_groups[0]["lr"]) for name, optimizer in self.host.items()}
         return replace(super().at(step), **rates)
+
+
+def host_settings(config: str, overrides: Sequence[str]) -> Config:
+    """The settings of a training in a host. Raises `InputError` for an override of one of `OWN_SETTINGS`."""
+    overrides = [overrides] if isinstance(overrides, str) else list(overrides)
+    for name in [override.partition("=")[0].strip() for override in overrides]:
+        if reason := OWN_SETTINGS.get(name) or OWN_SETTINGS.get(name.partition(".")[0]):
+            raise InputError(f"{name} is TurboStep's own: {reason}; leave it out of overrides")
+    return load_config(config, (*overrides, "train.exposure=false", "train.init=points"))
 
 
 def scene_of(images: PosedImages, gaussians: Gaussians, scale: float | None) -> Scene:
