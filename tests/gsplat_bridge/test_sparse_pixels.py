@@ -87,3 +87,6 @@ def test_what_is_no_data_set_of_images_is_refused_by_name():
     }
     for words, trainset in refused.items():
         assert_refused(words, maps_of_photos, trainset)
+    for value in (torch.nan, -torch.inf):
+        broken = {"image": torch.tensor([value, 2.0, 3.0]).expand(20, 30, 3)}
+        assert_refused(r"^trainset\[1\]\['image'\] has values that are not finite", maps_of_photos, [good, broken])

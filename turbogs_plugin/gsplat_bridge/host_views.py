@@ -53,6 +53,8 @@ def read_items(
             raise InputError(f"{place}['mask'] has shape {tuple(mask.shape)}: expected {expected}")
         values = np.asarray(image.detach().cpu(), dtype=np.float32)  # numpy has no threads that wait for each other
         low, high = float(values.min()), float(values.max())
+        if not np.isfinite((low, high)).all():
+            raise InputError(f"{place}['image'] has values that are not finite: expected 0 .. {white:g}")
         if not 0 <= low <= high <= white:
             raise InputError(f"{place}['image'] has values {low:g} .. {high:g}: expected 0 .. {white:g}; see white")
         whole = torch.ones(image.shape[:2], dtype=torch.bool) if mask is None else torch.as_tensor(mask).bool()
