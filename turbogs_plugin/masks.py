@@ -89,12 +89,15 @@ class PixelMasks:
             masks: [V, H, W] bool, or V images [H, W] whose sizes may differ. True (nonzero) pixels count.
 
         Raises:
-            InputError: no image, or one of another shape.
+            InputError: no image, one of another shape, or no pixel that counts in any.
         """
         if len(masks) == 0 or any(getattr(mask, "ndim", 0) != 2 for mask in masks):
             shapes = [tuple(getattr(mask, "shape", ())) for mask in masks][:4]
             raise InputError(f"masks have shapes {shapes}: expected [H, W] for each view, True where a pixel counts")
-        return cls.joined([cls.of(torch.as_tensor(mask).cpu().numpy() != 0) for mask in masks])
+        joined = cls.joined([cls.of(torch.as_tensor(mask).cpu().numpy() != 0) for mask in masks])
+        if not joined.pixel_counts.any():
+            raise InputError("masks leave no pixel of any photo: they may be inverted; True is where a pixel counts")
+        return joined
 
     def to(self, device: torch.device | str) -> PixelMasks:
         tensors = {name: getattr(self, name).to(device) for name in ("tiles", "rows", "bits")}

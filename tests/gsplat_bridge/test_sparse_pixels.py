@@ -79,6 +79,13 @@ def test_masks_of_a_trainset_are_heeded(of_first):
     assert maps.view_means()[0] == pytest.approx(float((images[0].sum(dim=-1) / 255)[mask].mean()), rel=1e-3)
 
 
+def test_masks_that_leave_no_pixel_are_refused_and_one_of_several_is_not():
+    image, masked = torch.full((20, 30, 3), 200), torch.zeros(20, 30, dtype=torch.bool)
+    inverted = [{"image": image, "mask": masked}] * 2
+    assert_refused("^masks leave no pixel of any photo: they may be inverted; True is", maps_of_photos, inverted)
+    assert maps_of_photos([*inverted, {"image": image}]).view_means()[:2].tolist() == [0, 0]
+
+
 def test_what_is_no_data_set_of_images_is_refused_by_name():
     good, place = {"image": torch.zeros(20, 30, 3)}, r"^trainset\[1\]\['image'\] is"
     refused = {

@@ -147,6 +147,7 @@ def with_item(**changes: Any) -> list[dict[str, Any]]:
         ({"views": with_item(image=torch.ones(HEIGHT, WIDTH, 4))}, r"views\[1\]\['image'\] is \(24, 40, 4\)"),
         ({"views": with_item(camtoworld=2 * torch.eye(4))}, r"views\[1\]\['camtoworld'\] .* without a scale"),
         ({"views": with_item(mask=torch.ones(3, 3))}, r"views\[1\]\['mask'\] has shape \(3, 3\)"),
+        ({"views": [view | {"mask": torch.zeros(HEIGHT, WIDTH)} for view in make_views()]}, "may be inverted; True is"),
         ({"views": [view | {"image": view["image"] / 255} for view in make_views()]}, "pass white=1"),
         ({"views": make_views(), "white": 1.0}, r"views\[0\]\['image'\] has values 0 .. \d+"),
         ({"options": {"pose_opt": True}}, "pose_opt=True does not work with TurboStep"),
