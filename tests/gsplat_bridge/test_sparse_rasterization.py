@@ -214,6 +214,8 @@ REFUSED = [
     ({"backgrounds": torch.ones(3)}, r"backgrounds has shape \(3,\): expected \[2, 3\]"),
     ({"means": torch.ones(40, 3).double()}, r"quats is of torch.float32 .*: expected torch.float64 on cpu"),
     ({"means": torch.ones(40, 3).half()}, r"means is of torch.float16: expected torch.float32 or torch.float64"),
+    ({"viewmats": np.zeros((2, 4, 4), np.float32)}, r"viewmats is ndarray: expected a tensor, by torch.from_numpy"),
+    ({"colors": [[0.5] * 3] * 40}, r"colors is list: expected a tensor"),
     ({"covars": torch.ones(40, 3, 3)}, r"covars=a tensor of shape \(40, 3, 3\) is not supported, only None"),
     ({"samples": None}, r"samples is a NoneType: expected the PixelSamples"),
     ({"width": 41}, r"samples are of 2 views .*expected 2, one for each of viewmats, all of \(41, 24\)"),

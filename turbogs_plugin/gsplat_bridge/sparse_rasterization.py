@@ -145,6 +145,9 @@ def _check_options(options: dict[str, Any]) -> None:
 def _check_tensors(given: dict[str, Tensor], sh_degree: int | None) -> None:
     """All are tensors of their shape, float32 or float64 as the means are, on the means' device; cameras want no
     gradient."""
+    for name, value in given.items():
+        if not isinstance(value, Tensor):
+            raise InputError(f"{name} is {type(value).__name__}: expected a tensor, by torch.from_numpy of an array")
     means, colors, count, cameras = given["means"], given["colors"], len(given["means"]), len(given["viewmats"])
     expected = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,)}
     expected["colors"] = (count, 3) if sh_degree is None else (count, *colors.shape[1:2], 3)
