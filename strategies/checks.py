@@ -1,4 +1,4 @@
-"""Checks of the settings of strategies."""
+"""Checks of the settings of strategies, and of what losses are called with."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from collections.abc import Callable
 from dataclasses import fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from turbogs_plugin.errors import require, require_not_negative
+from torch import Tensor
+
+from turbogs_plugin.errors import InputError, require, require_not_negative
+from turbogs_plugin.types import PixelSamples
 
 
 def require_settings(instance: Any) -> None:
@@ -40,3 +43,18 @@ def require_at_least_one(instance: Any, *names: str) -> None:
 def require_positive(instance: Any, *names: str) -> None:
     """Raise `InputError` unless each of these attributes is a finite number above 0."""
     require_each(instance, lambda value: 0 < value < math.inf, "a finite number above 0", *names)
+
+
+def check_samples(samples: Any) -> None:
+    """Raise `InputError` unless these are samples."""
+    if not isinstance(samples, PixelSamples):
+        raise InputError(f"samples is a {type(samples).__name__}: expected the PixelSamples that a sampler drew")
+
+
+def check_colors(colors: Any, targets: Any, samples: Any) -> None:
+    """Raise `InputError` unless these are samples and two colours of each. Values are not looked at: no GPU waits."""
+    check_samples(samples)
+    for name, value in (("colors", colors), ("targets", targets)):
+        if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != (len(samples), 3):
+            found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+            raise InputError(f"{name} is {found}: expected a tensor, floating point {(len(samples), 3)} as samples are")

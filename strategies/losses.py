@@ -14,7 +14,7 @@ from torch import Tensor
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.rules import STRUCTURE_CONSTANT, LossTerms
 from turbogs_plugin.errors import require
-from turbogs_plugin.strategies.checks import require_positive, require_settings
+from turbogs_plugin.strategies.checks import check_colors, require_positive, require_settings
 from turbogs_plugin.strategies.protocols import SparseLoss
 from turbogs_plugin.types import LossOutput, PixelSamples
 
@@ -43,6 +43,7 @@ class RuleLoss(SparseLoss):
         return LossTerms(EPSILON)
 
     def __call__(self, colors: Tensor, targets: Tensor, samples: PixelSamples) -> LossOutput:
+        check_colors(colors, targets, samples)
         return engine_of(colors.device).evaluate(self.terms, colors, targets, samples)
 
 

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from helpers.refusals import assert_refused
 
 from turbogs_plugin.engine.reference.losses import Problem, window_similarity
 from turbogs_plugin.strategies.losses import EPSILON, CharbonnierLoss, CharbonnierNccLoss, SparseSsimLoss
@@ -231,6 +232,14 @@ def test_half_precision_input_is_computed_in_single(loss):
     assert torch.allclose(result.color_gradients, reference, rtol=1e-3, atol=1e-7)
 
 
-def test_wrong_shapes_are_named():
-    with pytest.raises(ValueError, match=r"\(3, 3\) and \(4, 3\), expected \(4, 3\)"):
-        CharbonnierLoss()(torch.zeros(3, 3), torch.zeros(4, 3), make_samples([4]))
+@pytest.mark.parametrize("loss", EVERY, ids=repr)
+def test_what_does_not_fit_is_named(loss):
+    colors, targets, samples = random_case()
+    refused = {
+        r"^colors is ndarray: expected a tensor, floating point \(30, 3\)": (colors.numpy(), targets, samples),
+        r"^targets is torch.uint8 \(30, 3\): expected a tensor": (colors, targets.byte(), samples),
+        r"^targets is torch.float64 \(29, 3\): expected a tensor": (colors, targets[:29], samples),
+        "^samples is a NoneType: expected the PixelSamples": (colors, targets, None),
+    }
+    for words, given in refused.items():
+        assert_refused(words, loss, *given)

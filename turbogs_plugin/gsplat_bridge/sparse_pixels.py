@@ -16,6 +16,7 @@ from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.gsplat_bridge.host import IN_IMAGES, require_options
 from turbogs_plugin.gsplat_bridge.host_views import read_items
+from turbogs_plugin.strategies.checks import check_colors, check_samples
 from turbogs_plugin.strategies.protocols import SparseLoss
 from turbogs_plugin.types import LossOutput, PixelSamples, SamplingBudget, Step
 
@@ -95,11 +96,7 @@ def sparse_loss(
     Raises:
         InputError: `loss` is something else, as torch's are; or an argument does not fit the samples.
     """
-    check_samples(samples)
-    for name, value in (("colors", colors), ("targets", targets)):
-        if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != (len(samples), 3):
-            found = f"{value.dtype} {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
-            raise InputError(f"{name} is {found}: expected floating point {(len(samples), 3)}, as there are samples")
+    check_colors(colors, targets, samples)
     given, engine = (colors.detach(), targets.detach(), samples), engine_of(colors.device)
     if maps is None and step is None:
         return _Loss.apply(colors, _called(loss, *given))
@@ -140,9 +137,3 @@ class _Loss(torch.autograd.Function):
     def backward(ctx, upstream: Tensor):
         (gradients,) = ctx.saved_tensors
         return upstream * gradients, None
-
-
-def check_samples(samples: Any) -> None:
-    """Raise `InputError` unless these are samples."""
-    if not isinstance(samples, PixelSamples):
-        raise InputError(f"samples is a {type(samples).__name__}: expected the PixelSamples that a sampler drew")

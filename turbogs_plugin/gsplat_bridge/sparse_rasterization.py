@@ -15,7 +15,7 @@ from turbogs_plugin.engine.render_pass import RasterSettings
 from turbogs_plugin.errors import InputError, nearest
 from turbogs_plugin.gsplat_bridge.autograd import Info, rasterize_differentiable
 from turbogs_plugin.gsplat_bridge.host import require_one_process
-from turbogs_plugin.gsplat_bridge.sparse_pixels import check_samples
+from turbogs_plugin.strategies.checks import check_samples
 from turbogs_plugin.types import SH_C0, TILE_SIZE, Cameras, Gaussians, PixelSamples
 
 LOGIT_MARGIN = 2.0**-23

@@ -168,10 +168,6 @@ class Problem:
     """
 
     def __init__(self, colors: Tensor, targets: Tensor, samples: PixelSamples, epsilon: float) -> None:
-        expected = (len(samples), 3)
-        if colors.shape != expected or targets.shape != expected:
-            shapes = f"{tuple(colors.shape)} and {tuple(targets.shape)}"
-            raise ValueError(f"colors and targets have shapes {shapes}, expected {expected} as there are slots")
         dtype = torch.promote_types(torch.promote_types(colors.dtype, targets.dtype), torch.float32)
         self.samples = samples
         used = samples.filled & torch.isfinite(colors).all(dim=1)
