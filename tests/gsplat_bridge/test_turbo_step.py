@@ -203,6 +203,7 @@ def test_our_length():
     assert TurboStep(make_splats(), make_views()).max_steps == 2000
     several = TurboStep.proposed_steps(40, overrides=["train.epochs=70"])
     assert several == TurboStep.proposed_steps(40, overrides="train.epochs=70") != TurboStep.proposed_steps(40)
+    assert TurboStep.proposed_steps(40, overrides="train.iterations=500") == 500  # as long as it is without max_steps
     assert_refused("train.seed is TurboStep's own", TurboStep.proposed_steps, 40, overrides="train.seed=1")
 
 

@@ -33,7 +33,7 @@ from turbogs_plugin.model.initial import BACKDROP_COUNT
 from turbogs_plugin.model.limits import RESTRAIN_EVERY
 from turbogs_plugin.model.torch_file import BANDS
 from turbogs_plugin.plan import SceneFacts, make_plan
-from turbogs_plugin.plan.decisions import wanted_iterations
+from turbogs_plugin.plan.decisions import decide
 from turbogs_plugin.scene import Frame, PosedImages, Scene
 from turbogs_plugin.scene.photos import PhotoSamples
 from turbogs_plugin.strategies.learning_rates import LearningRates
@@ -153,7 +153,7 @@ class TurboStep:
     def proposed_steps(num_views: int, config: str = DEFAULT_CONFIG, overrides: Sequence[str] = ()) -> int:
         """The length that we propose for this number of training views."""
         facts = SceneFacts(num_views, 0.0, 0, 0, "cpu", 0, 0)
-        return int(wanted_iterations(facts, host_settings(config, overrides))[0])
+        return int(decide("iterations", facts, host_settings(config, overrides)).value)
 
     def step(self, step: int) -> StepInfo:
         """Make the step of this number, `steps`. Raises `InputError` for another, or another number of Gaussians."""
