@@ -83,12 +83,12 @@ def assert_alike(a: Gaussians, b: Gaussians) -> None:
 
 
 def test_a_given_model_has_the_tables_and_pictures_of_its_run(turbogs, finished, model, capture, tmp_path):
-    """In every form in which it can be given: ours, gsplat's two, a checkpoint, a run."""
+    """In every form in which it can be given: ours, gsplat's two, a checkpoint."""
     asked, pictures = table(turbogs("eval", finished, "--device", "cpu")[1]), tmp_path / "pictures"
     theirs = tmp_path / "gsplat.ply"
     export_splats(**{name: value.float() for name, value in model.items()}, save_to=str(theirs))
     pt, checkpoint = save_splats(tmp_path / "ckpt_6999_rank0.pt", model), latest_checkpoint(finished / "checkpoints")
-    for file in (finished / "model.ply", theirs, pt, checkpoint, finished):
+    for file in (finished / "model.ply", theirs, pt, checkpoint):
         code, out, error = turbogs("eval", file, "--scene", capture, "--device", "cpu")
         assert (code, table(out), error) == (0, asked, "")
         assert f"{file}, " in out
@@ -221,6 +221,13 @@ def test_a_model_that_is_larger_than_the_cap_is_refused(finished, scene):
         tiny_trainer(scene, f"train.init={finished}", "density.max_gaussians=100")
     with pytest.raises(InputError, match="no room beside the 3000"):
         tiny_trainer(scene, "density.max_gaussians=3000", "train.backdrop=true")
+
+
+@pytest.mark.parametrize("words", ["eval", "view", "render", "export", "render --path views --out NEW.mp4"])
+def test_a_runs_folder_is_refused_beside_a_capture(turbogs, finished, capture, tmp_path, words):
+    verb, *options = words.replace("NEW", str(tmp_path / "new")).split()
+    call = (verb, finished, *options, "--scene", capture)
+    assert_one_line(turbogs(*call), f"'{finished}' is a run's folder", "leave --scene out", "scene.path")
 
 
 BAD_FILES = {

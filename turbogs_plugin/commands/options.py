@@ -78,7 +78,7 @@ class GivenOptions:
     """Options of eval, render, export and view for a model in the place of a run.
 
     Args:
-        scene: the capture of a model from a file: a 3DGS .ply, .spz, gsplat's .pt, or a checkpoint. Not with a run.
+        scene: the capture of a model from a file: a .ply, .spz, gsplat's .pt, or a checkpoint. Not with a run's folder.
         factor: scale its photos down by this.
     """
 
@@ -89,7 +89,8 @@ class GivenOptions:
         """The capture and how to render it; None for a run, which says that itself."""
         if self.scene is None:
             if overrides or self.factor is not None:
-                raise InputError("a run uses its own configuration: --factor and overrides need --scene")
+                option = overrides[0] if self.factor is None else "--factor"
+                raise InputError(f"{option} is for a model's file with --scene: a run uses its own configuration")
             return None
         asked = RunOptions(factor=self.factor).settings(self.scene, overrides)
         background = {"background": asked.train.background}  # auto goes by the photos, as in a run

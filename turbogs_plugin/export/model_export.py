@@ -29,7 +29,7 @@ from turbogs_plugin.scene.geometry import evenly
 from turbogs_plugin.scene.offload import place_views
 from turbogs_plugin.train.inputs import resolve_device
 from turbogs_plugin.train.metrics import evaluate
-from turbogs_plugin.train.saved_model import load_with_capture
+from turbogs_plugin.train.saved_model import given_model, load_with_capture
 from turbogs_plugin.types import Cameras, Gaussians
 
 PAGE = "html"
@@ -124,7 +124,7 @@ def _required_file(
         if out.suffix.lower() != f".{suffix}":
             raise InputError(f"--out '{out}': --format {file_format} needs a name that ends in .{suffix}")
     elif given is not None:
-        raise InputError(f"'{path}' has no run's folder to export into: name a new file by --out")
+        raise InputError(f"'{given_model(path)}' has no run's folder to export into: name a new file by --out")
     return out or path / ("export.ply" if suffix == "ply" else f"model.{suffix}")
 
 

@@ -20,6 +20,7 @@ from turbogs_plugin.report.evaluation import open_saved, views_of
 from turbogs_plugin.report.images import depth_picture, save_image, to_uint8
 from turbogs_plugin.train.look import Look
 from turbogs_plugin.train.run_files import RunFolder
+from turbogs_plugin.train.saved_model import given_model
 from turbogs_plugin.types import Cameras, Gaussians
 
 PATHS = {"orbit": orbit, "views": through_views}
@@ -49,7 +50,7 @@ def render_run(
     if out is not None:
         require_writable(out, f"--out '{out}'")
     elif given is not None:
-        raise InputError(f"'{path}' has no run's folder to render into: name one by --out FOLDER")
+        raise InputError(f"'{given_model(path)}' has no run's folder to render into: name one by --out FOLDER")
     model, scene = open_saved(path, device_name, given)
     views, look = views_of(model, scene, split)
     target = out or RunFolder(path).renders
@@ -115,14 +116,12 @@ def film_run(
 
 
 def write_film(gaussians: Gaussians, look: Look, cameras: Cameras, video: Path, fps: float) -> None:
-    """Render a model, as it looks, and encode a film. Nothing is left behind where this fails.
+    """Render a model, as it looks, and encode a film. Nothing is left behind where this fails: by `InputError`, where
+    the encoder refuses.
 
     Args:
         cameras: of the frames, all of one size; an odd side loses a pixel, which the encoder needs.
         video: a new file, whose suffix says which container.
-
-    Raises:
-        InputError: the encoder refused.
     """
     import imageio_ffmpeg
 

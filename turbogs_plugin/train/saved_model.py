@@ -96,7 +96,7 @@ def load_with_capture(
     """The newest model of a run, or a model's file, whose capture and rendering are `given`; its capture; and why that
     is None: it is not there, and not `needed`. Raises `InputError`: no such model, or no usable capture if needed."""
     if given is not None:
-        require_model(path)  # before its capture is read
+        given_model(path)  # before its capture is read
         scene = open_scene(given.scene, given.train.refine_cameras)
         gaussians, antialiased = load_given(path, scene, given.train.init_world)
         gaussians = gaussians.map(lambda value: value.to(device))
@@ -109,6 +109,15 @@ def load_with_capture(
         if needed:
             raise
         return model, None, str(error)
+
+
+def given_model(path: Path) -> Path:
+    """The file of a model that is given with a capture, as of `require_model`. Raises `InputError`, too, for the folder
+    of a run, whose own capture and settings would not be used."""
+    if (config := RunFolder(path).config).is_file():
+        moved = f"if the capture has moved, write its new place into '{config}' as scene.path"
+        raise InputError(f"'{path}' is a run's folder, which has its own settings: leave --scene out; {moved}")
+    return require_model(path)
 
 
 def require_model(path: str | Path) -> Path:
