@@ -243,6 +243,9 @@ def test_ctrl_c_saves_and_says_how_to_go_on(turbogs, capture, tmp_path, monkeypa
     code, out, err = turbogs("train", capture, "--out", tmp_path / "run", "--device", "cpu", *TINY)
     assert code == 130 and out == "" and f"turbogs train --resume {tmp_path / 'run'}" in err
     assert (tmp_path / "run/checkpoints/iteration-000003.pt").is_file() and "--trust" not in err
+    for verb in ("eval", "render", "export"):
+        with pytest.warns(UserWarning, match=f"^{tmp_path}/run is not finished: iteration 3 of 14$"):
+            assert turbogs(verb, tmp_path / "run")[0] == 0
     (tmp_path / "mine.py").write_text("from turbogs_plugin.strategies import RandomPixelSampler as Mine\n")
     monkeypatch.chdir(tmp_path)
     words = ("--out", "own", "--device", "cpu", *TINY, "pixel_sampler.type=mine:Mine")

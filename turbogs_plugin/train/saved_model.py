@@ -43,13 +43,14 @@ _SAVED = ("checkpoints/iteration-*.pt", "point_cloud/iteration_*/point_cloud.ply
 @dataclass
 class SavedModel:
     """The parts of a run needed to render or export its model, with `exposures` [V, 3, 4] of training photos if learnt;
-    or a model from a file, without `folder` and `iteration`, which may be `antialiased` (`render_image`)."""
+    or a model from a file, without `folder`, `iteration` and `iterations`, which may be `antialiased`."""
 
     folder: RunFolder | None
     config: Config
     gaussians: Gaussians
     frame: Frame
     iteration: int | None
+    iterations: int | None = None
     exposures: Tensor | None = None
     antialiased: bool = False
 
@@ -85,7 +86,8 @@ def load_model(path: Path, device: torch.device) -> SavedModel:
             raise ValueError("its Gaussians are not finite, or its iteration is none")
         if exposures is not None and not (exposures.shape[1:] == (3, 4) and exposures.isfinite().all()):
             raise ValueError("its exposures are none")
-        return SavedModel(folder, config, gaussians, Frame(**state["frame"]), iteration, exposures)
+        iterations = operator.index(state["pace"]["iterations"])  # which a time budget changes
+        return SavedModel(folder, config, gaussians, Frame(**state["frame"]), iteration, iterations, exposures)
     except (KeyError, TypeError, AttributeError, IndexError, ValueError, RuntimeError) as error:
         raise InputError(f"checkpoint '{checkpoint}' is not one of a run: {error}") from None
 
@@ -94,21 +96,25 @@ def load_with_capture(
     path: Path, given: Config | None, device: torch.device, needed: bool = True
 ) -> tuple[SavedModel, Scene | None, str]:
     """The newest model of a run, or a model's file, whose capture and rendering are `given`; its capture; and why that
-    is None: it is not there, and not `needed`. Raises `InputError`: no such model, or no usable capture if needed."""
+    is None: it is not there, and not `needed`. Warns of an unfinished run. Raises `InputError`: no such model, or no
+    usable capture if needed."""
     if given is not None:
         given_model(path)  # before its capture is read
         scene = open_scene(given.scene, given.train.refine_cameras)
         gaussians, antialiased = load_given(path, scene, given.train.init_world)
         gaussians = gaussians.map(lambda value: value.to(device))
-        return SavedModel(None, given, gaussians, scene.frame, None, None, antialiased), scene, ""
+        return SavedModel(None, given, gaussians, scene.frame, None, antialiased=antialiased), scene, ""
     model = load_model(path, device)
-    settings, refine = model.config.scene, model.config.train.refine_cameras
+    found: tuple[Scene | None, str]
     try:
-        return model, open_scene(settings, refine, trained=RunFolder(path).config), ""
+        found = open_scene(model.config.scene, model.config.train.refine_cameras, trained=RunFolder(path).config), ""
     except InputError as error:
         if needed:
             raise
-        return model, None, str(error)
+        found = None, str(error)
+    if model.iteration != model.iterations:  # said last, as an error is one line alone
+        warnings.warn(f"{path} is not finished: iteration {model.iteration} of {model.iterations}", stacklevel=2)
+    return model, *found
 
 
 def given_model(path: Path) -> Path:
