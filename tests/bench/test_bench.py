@@ -13,8 +13,10 @@ from helpers.simulated_time import OperatorTime, SimulatedTime
 from helpers.synthetic_capture import surface_gaussians
 
 from turbogs_plugin.bench import floors
+from turbogs_plugin.bench.step import bench_step
 from turbogs_plugin.bench.timing import BLOCKS, STEPS, Mark, Recorder, back_to_back, measure, recorded, summary
 from turbogs_plugin.bench.workloads import resized
+from turbogs_plugin.model.initial import with_degree
 from turbogs_plugin.model.ply import save_ply
 
 CPU = torch.device("cpu")
@@ -98,6 +100,11 @@ def test_bench_step_says_what_it_measured_on(turbogs, capture, ply, tmp_path):
         assert entry["counts"]["pixels"] == entry["views"] * 40 * 24
         assert entry["memory_bytes"]["parameters"] > 500 * 4 * 14
         assert entry["lost_iterations"] == 0 and entry["wall"]["median_ms"] > 0
+
+
+def test_bench_step_uses_the_bands_that_the_model_has(scene):
+    model = with_degree(surface_gaussians(100, CPU), 1)
+    assert len(bench_step(scene, [model], (1,), 1, ["train.device=cpu"])["passes"]) == 1
 
 
 def test_bench_raster_says_what_it_measured_on(turbogs, capture, ply, tmp_path):

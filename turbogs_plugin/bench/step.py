@@ -59,6 +59,7 @@ def bench_step(
         bandwidth = copy_bandwidth(device)
         for count in views:
             config = timed_config(overrides, count)
+            config = config.changed(train={"sh_degree": min(config.train.sh_degree, model.sh_degree)})
             gc.collect()  # of the trainer before, whose memory would count as held
             held = torch.cuda.memory_allocated(device) if device.type == "cuda" else 0
             trainer = trainer_of(config, scene, model, device)
