@@ -295,6 +295,8 @@ def test_a_run_without_a_report_tells_its_model_and_both_clocks(turbogs, capture
         ("evaluate run", "no such command 'evaluate': did you mean 'eval'?"),
         ("train s --out r --factor abc", "--factor takes only whole numbers; see turbogs train --help"),
         ("train s --out r --device tpu", "'tpu' is none of auto, cpu, cuda; see turbogs train --help"),
+        ("render r --path orbit", "--path writes a film: name its new file by --out FILE.mp4"),
+        ("render r --path orbit --out f.mp4 --depth", "--path writes a film of colours: leave --depth out"),
         ("eval r --factor 2", "--factor is for a model's file with --scene"),
         ("train s --out --factor 2", "--out lacks a value; see turbogs train --help"),
         ("eval", "turbogs eval: it needs RUN|MODEL; see turbogs eval --help"),

@@ -91,8 +91,10 @@ def render(
         folders = render_run(run, split, device, depth, settings, out)
         print("\n".join(f"{name:<8} {folder}" for name, folder in zip(("renders", "depths"), folders, strict=False)))
     else:
-        if depth or split != "test" or out is None:
-            raise InputError("--path writes a film: it takes --out FILE.mp4, not --split or --depth")
+        if depth or split != "test":
+            raise InputError(f"--path writes a film of colours: leave {'--depth' if depth else '--split'} out")
+        if out is None:
+            raise InputError("--path writes a film: name its new file by --out FILE.mp4")
         print(f"film   {film_run(run, path, out, device, settings, seconds, fps, size)}")
     return 0
 
