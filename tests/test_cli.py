@@ -295,6 +295,8 @@ def test_a_run_without_a_report_tells_its_model_and_both_clocks(turbogs, capture
         ("evaluate run", "no such command 'evaluate': did you mean 'eval'?"),
         ("train s --out r --factor abc", "--factor takes only whole numbers; see turbogs train --help"),
         ("train s --out r --device tpu", "'tpu' is none of auto, cpu, cuda; see turbogs train --help"),
+        ("ablate parts --scene s --out o --only a train.seed=1", "put changes of settings before --only; see"),
+        ("ablate parts --scene s --out o --seeds 0 train.seed=1", "put changes of settings before --seeds; see"),
         ("render r --path orbit", "--path writes a film: name its new file by --out FILE.mp4"),
         ("render r --path orbit --out f.mp4 --depth", "--path writes a film of colours: leave --depth out"),
         ("eval r --factor 2", "--factor is for a model's file with --scene"),

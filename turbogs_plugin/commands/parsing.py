@@ -15,6 +15,8 @@ from tyro import _errors as tyro_errors
 from turbogs_plugin.errors import InputError, nearest
 
 Command = Callable[..., int]
+CHANGE = re.compile(r"\b[a-z]\w*\.[\w.]+=")
+"""The beginning of a change of settings, section.key=value."""
 
 
 def help_text(commands: Mapping[str, Command]) -> str:
@@ -47,6 +49,9 @@ def parsed(commands: Mapping[str, Command], words: Sequence[str]) -> Callable[[]
 
     with tyro_errors.on_parse_error(lambda event: refuse(_mistake(event))):
         call, left = tyro.cli(later, prog=f"turbogs {verb}", args=rest, return_unknown_args=True)
+    for name, value in call.keywords.items():
+        if isinstance(value, tuple) and any(isinstance(word, str) and CHANGE.match(word) for word in value):
+            refuse(f"put changes of settings before --{name.replace('_', '-')}")
     if not left:
         return call
     if "overrides" not in signature(function).parameters or any(word.startswith("-") for word in left):
@@ -66,6 +71,8 @@ def _mistake(event: tyro_errors.ParseErrorEvent) -> str:
     if isinstance(event, tyro_errors.BadValue):
         return f"{event.argument.display_name()} lacks a value"
     if isinstance(event, tyro_errors.InstantiationFailure) and event.argument is not None:
+        if event.argument.lowered.nargs == "*" and CHANGE.search(event.message):
+            return f"put changes of settings before {event.argument.display_name()}"
         kind = "whole numbers" if re.search(r"\bint\b", str(event.argument.field.type)) else "numbers"
         return f"{event.argument.display_name()} takes only {kind}"
     return str(event)
