@@ -117,7 +117,7 @@ REFUSED = [
     ("pixel_sampler", {"type": "third_party:MySampler", "share": 2.0}, "pixel_sampler: share = 2.0 is too much"),
     ("pixel_sampler", {"type": "third_party:Unresolved"}, "a type of Unresolved's fields.*Absent"),
     ("loss", {"type": "third_party:MySampler"}, "is no SparseLoss: it lacks __call__; inherit from"),
-    ("density", {"type": "third_party:Half"}, "lacks stats, event_due, growth_room, apply, state_dict, load_state"),
+    ("density", {"type": "third_party:Half"}, "lacks stats, uses_errors, event_due, growth_room, apply, state"),
 ]
 
 

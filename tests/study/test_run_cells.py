@@ -248,6 +248,7 @@ def test_a_cell_has_the_planned_length_and_keeps_a_cap_on_gaussians(tmp_path, mo
         ("ablate components --out X", "needs --scene"),
         ("ablate components --scene absent --out X", "no such scene"),
         ("ablate components --scene CAPTURE --out X --seeds 1 1", "seeds"),
+        ("ablate components --scene CAPTURE --out X --seeds 1 --seeds 2", "--seeds is given twice"),
         ("ablate components --scene CAPTURE --scene CAPTURE --out X", "are called the same"),
         ("ablate components --scene CAPTURE --out X --gpus 0", "--gpus 0"),
         ("ablate components train.seed=5 --scene CAPTURE --out X", "train.seed is given by --seeds"),

@@ -47,6 +47,11 @@ def parsed(commands: Mapping[str, Command], words: Sequence[str]) -> Callable[[]
     def refuse(said: str) -> None:
         raise InputError(f"turbogs {verb}: {_unknown_option(function, rest) or said}; see turbogs {verb} --help")
 
+    for name, parameter in signature(function).parameters.items():
+        option, kind = f"--{name.replace('_', '-')}", str(parameter.annotation)
+        lists = "tuple[" in kind and "UseAppendAction" not in kind  # of which tyro takes the last alone
+        if lists and sum(word.partition("=")[0] == option for word in rest) > 1:
+            refuse(f"{option} is given twice: give it once, with all that it takes")
     with tyro_errors.on_parse_error(lambda event: refuse(_mistake(event))):
         call, left = tyro.cli(later, prog=f"turbogs {verb}", args=rest, return_unknown_args=True)
     for name, value in call.keywords.items():
