@@ -23,12 +23,12 @@ constexpr int kAhead = 4;                           // splats whose arithmetic o
 constexpr int kBucketLanes = 4;                     // lanes that list the splats of one bucket
 constexpr int kLaneBits = kBucket / kBucketLanes;   // bits of its mask that each of them takes
 constexpr int kListBuckets = kWarpSize / kBucketLanes;  // buckets whose bits become a list at once
+constexpr float kTwoLn2 = 1.3862943611198906f;          // d sigma = 2 ln(2) (u du + v dv)
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900 && __CUDA_ARCH__ < 1200
 constexpr int kWarpsPerSm = 28;  // as many as shared memory holds: 72 registers at most
 #else
 constexpr int kWarpsPerSm = 1;  // no bound
 #endif
-constexpr float kTwoLn2 = 1.3862943611198906f;          // d sigma = 2 ln(2) (u du + v dv)
 
 template <bool kDepth, bool kErrors>
 struct BackwardShared {
@@ -256,7 +256,8 @@ __device__ __forceinline__ void send_record(float* target, const float record[Sc
 }
 
 template <bool kDepth, bool kErrors, bool kDensity>
-__global__ void __launch_bounds__(kWarpSize, kWarpsPerSm) backward_kernel(const __grid_constant__ BackwardParams params) {
+__global__ void __launch_bounds__(kWarpSize, kWarpsPerSm)
+    backward_kernel(const __grid_constant__ BackwardParams params) {
     __shared__ BackwardShared<kDepth, kErrors> shared;
     const ForwardParams& forward = params.forward;
     const int lane = threadIdx.x, row = lane % kSplats, share = lane / kSplats;

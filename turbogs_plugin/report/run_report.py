@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import shlex
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -40,17 +41,21 @@ def write_report(run: RunSession) -> Path:
     worst = [int(view) for view in np.argsort(-view_errors)[:STRIPS] if doubted(view_errors)[view]]
     shown = [("test", run.test, look, list(range(strips)))]
     shown += [("doubted", trainer.views, trainer.look(trainer.views.names), worst)] if worst else []
-    for kind, views, seen, view_ids in shown:
-        for view_id in view_ids:
-            image = render_view(trainer.gaussians, views, view_id, seen)
-            pixels = strip(views.photos.image(view_id, seen.background), image, views.mask(view_id)).cpu().numpy()
-            save_image(pictures / f"{kind}-{view_id:03d}.jpg", titled(pixels))
-    from turbogs_plugin.report.curves import plot_against_seconds  # loads matplotlib
+    with ThreadPoolExecutor() as pool:  # pictures are encoded while others are rendered and plots are drawn
+        encoded = []
+        for kind, views, seen, view_ids in shown:
+            for view_id in view_ids:
+                image = render_view(trainer.gaussians, views, view_id, seen)
+                pixels = strip(views.photos.image(view_id, seen.background), image, views.mask(view_id)).cpu().numpy()
+                encoded.append(pool.submit(save_image, pictures / f"{kind}-{view_id:03d}.jpg", titled(pixels)))
+        from turbogs_plugin.report.curves import plot_against_seconds  # loads matplotlib
 
-    seconds = [evaluation.train_seconds for evaluation in run.history]
-    for name, label in (("psnr", "test PSNR in dB"), ("l1", "mean absolute error on test views (0 .. 1)")):
-        values = [getattr(evaluation, name) for evaluation in run.history]
-        plot_against_seconds(pictures / f"{name}.png", seconds, values, label, run.scene.name)
+        seconds = [evaluation.train_seconds for evaluation in run.history]
+        for name, label in (("psnr", "test PSNR in dB"), ("l1", "mean absolute error on test views (0 .. 1)")):
+            values = [getattr(evaluation, name) for evaluation in run.history]
+            plot_against_seconds(pictures / f"{name}.png", seconds, values, label, run.scene.name)
+        for picture in encoded:
+            picture.result()
     run.clock.mark("pictures and plots")
     times = {view: view_errors[view] / np.median(view_errors) for view in worst}
     write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, strips, times))
