@@ -152,7 +152,7 @@ def test_swaps_train_over_gsplats_rasterizer(packed, tells_errors, optimizer_cla
         "adam": lambda: SharedOptimizer(SparseAdam()),
         "lm": lambda: SharedOptimizer(MomentLMOptimizer()),
     }[optimizer_class]()
-    strategy = TurboDensityStrategy(**SOON, grow_grad2d=1e-6)
+    strategy = TurboDensityStrategy(**SOON, grow_grad2d=1e-6, grow_absgrad2d=1e-6)
     losses, splats = train(strategy, made, packed, tells_errors, steps=20)
     assert losses[-1] < losses[0] and len(splats["means"]) > COUNT
 

@@ -18,7 +18,7 @@ from turbogs_plugin.model.row_order import in_order_of_space
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, GaussianStats, RowUpdate, Step
 
-SOON = {"refine_start_iter": 2, "refine_every": 3, "refine_stop_iter": 5, "grow_grad2d": 1e-6}
+SOON = {"refine_start_iter": 2, "refine_every": 3, "refine_stop_iter": 5, "grow_grad2d": 1e-6, "grow_absgrad2d": 1e-6}
 
 
 def test_it_is_a_default_strategy_with_its_hooks():
@@ -31,9 +31,11 @@ def test_it_is_a_default_strategy_with_its_hooks():
 
 def test_its_defaults_are_the_values_of_turbogs():
     section, controller = load_config("turbogs").density, vars(TurboDensityStrategy()._controller(0))
-    for name in ("percent_dense", "split", "opacity_decay"):
+    for name in ("percent_dense", "split", "absgrad_threshold", "choose_by"):
         assert controller[name] == section[name] != vars(ErrorDrivenDensity())[name]
-    assert controller["choose_by"] == "difficulty" and controller["final_keep"] == 1.0
+    for name, digits in (("opacity_decay", 2), ("prune_score_fraction", 3)):  # 145 events in the place of 33
+        assert controller[name] == round(1 - (1 - section[name]) ** (33 / 145), digits)
+    assert controller["final_keep"] == 1.0
 
 
 @dataclass
@@ -60,7 +62,7 @@ def test_it_trains_and_says_once_what_drives_it(tells_errors, capsys):
     said = [line for line in capsys.readouterr().out.splitlines() if "TurboDensityStrategy" in line]
     assert len(said) == 1
     assert ("error-driven, by info['prediction']" in said[0]) == tells_errors
-    assert ("ranked by screen gradients" in said[0]) != tells_errors
+    assert ("driven by squares of screen gradients" in said[0]) != tells_errors
 
 
 def test_the_state_has_the_statistics_of_each_step_once():
@@ -76,8 +78,8 @@ def test_the_state_has_the_statistics_of_each_step_once():
 
 
 def test_schedule_events_happen_where_gsplats_do():
-    for cls in (DefaultStrategy, TurboDensityStrategy):
-        host = Host(cls(refine_start_iter=3, refine_every=3, refine_stop_iter=12, grow_grad2d=1e-9))
+    for cls, threshold in ((DefaultStrategy, "grow_grad2d"), (TurboDensityStrategy, "grow_absgrad2d")):
+        host = Host(cls(refine_start_iter=3, refine_every=3, refine_stop_iter=12, **{threshold: 1e-9}))
         counts = [40, *(len(host.splats["means"]) for step in range(16) if host.step(step))]
         assert [step for step in range(16) if counts[step + 1] != counts[step]] == [6, 9]
 
@@ -86,9 +88,10 @@ EVENT = 3
 """The step of the only event of `test_an_event_is_the_controllers`."""
 
 BASE = {"refine_start_iter": 2, "refine_every": 3, "grow_grad2d": 0.02, "grow_absgrad2d": 0.02, "grow_scale3d": 0.17}
-BASE |= {"top_fraction": 0.5, "opacity_decay": 0.0}
+BASE |= {"top_fraction": 0.5, "opacity_decay": 0.0, "prune_score_fraction": 0.1}
 BASE_OF_CONTROLLER = {"refine_from": 3, "refine_every": 3, "grad_threshold": 0.02, "absgrad_threshold": 0.02}
 BASE_OF_CONTROLLER |= {"percent_dense": 0.17, "top_fraction": 0.5, "final_keep": 1.0, "split": "long_axis"}
+BASE_OF_CONTROLLER |= {"prune_score_fraction": 0.1}
 """Settings of `ErrorDrivenDensity` by which the same happens as by `BASE`."""
 
 FIELDS = {"grow_grad2d": 0.001, "grow_absgrad2d": 0.05, "grow_scale3d": 0.2, "prune_opa": 0.4, "prune_scale3d": 0.16}
@@ -115,9 +118,9 @@ def test_fields_are_the_controllers_settings_whenever_they_change():
     assert [strategy._controller(step).prune_screen_size for step in (4, 5)] == [0.2, 0.0]
 
 
-def controlled(before, window, extent):
+def controlled(before, window, extent, rule):
     """The Gaussians after the event by an `ErrorDrivenDensity`, in the order of space."""
-    controller = ErrorDrivenDensity(**BASE_OF_CONTROLLER)
+    controller = ErrorDrivenDensity(**BASE_OF_CONTROLLER, choose_by=rule)
     controller.setup(before)
     controller.load_state_dict({"stats": window})
     step = Step(EVENT, 10**6, 14_999, scene_extent=extent)
@@ -146,16 +149,17 @@ def test_an_event_is_the_controllers(fields, extent, tells_errors):
     window["max_radii"] = torch.stack([stats.max_radii for stats in seen]).amax(dim=0)
     if not tells_errors:
         assert not window["error_sums"].any() and not window["weight_sums"].any()
-        window |= {"error_sums": window["grad_sums"], "weight_sums": window["view_counts"]}
-    without_absolute = {**window, "absgrad_sums": torch.zeros(40)}
+        window |= {"weight_sums": window["view_counts"]}
+    without_absolute = {**window, "absgrad_sums": window["grad_sums"]}
+    rule = "difficulty" if tells_errors else "squares"
     before = Gaussians(**{key: before[key] for key in PARAMETER_NAMES})
-    expected = controlled(before, window if strategy.absgrad else without_absolute, extent)
+    expected = controlled(before, window if strategy.absgrad else without_absolute, extent, rule)
     after = Gaussians(**{key: host.splats[key].detach() for key in PARAMETER_NAMES})
     for (key, value), (_, wanted) in zip(after.items(), expected.items(), strict=True):
         torch.testing.assert_close(value, wanted, msg=lambda text, key=key: f"{key}: {text}")
     assert all(len(host.state[key]) == len(after) and not host.state[key].any() for key in window)
     if fields or extent != 1.0:
-        assert not equal(after, controlled(before, window, 1.0))
+        assert not equal(after, controlled(before, window, 1.0, rule))
 
 
 def test_a_cap_holds_at_any_step():

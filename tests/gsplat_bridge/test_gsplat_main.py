@@ -9,7 +9,7 @@ from helpers.gsplat_stand_ins import Scene
 
 from turbogs_plugin.gsplat_bridge import TurboDensityStrategy
 
-SOON = {"refine_start_iter": 2, "refine_every": 3, "refine_stop_iter": 8, "grow_grad2d": 1e-6, "prune_opa": 0.2}
+SOON = {"refine_start_iter": 2, "refine_every": 3, "refine_stop_iter": 8, "grow_absgrad2d": 1e-6, "prune_opa": 0.2}
 
 
 @pytest.mark.parametrize("tells_errors", [False, True])

@@ -25,7 +25,10 @@ def test_it_gives_the_sums_that_our_rasterizer_gives(rendered, packed, monkeypat
     assert has_errors and expected.error_sums.sum() > 1
     for name in ("error_sums", "weight_sums", "grad_sums", "absgrad_sums", "view_counts", "max_radii"):
         torch.testing.assert_close(getattr(actual, name), getattr(expected, name), rtol=2e-3, atol=2e-3)
-    assert not actual.distance_sums.any() and not actual.square_sums.any()
+    assert not actual.distance_sums.any()
+    half = 0.5 * rendered["n_cameras"] * torch.tensor([rendered["width"], rendered["height"]])
+    squares = (rendered["means2d"].absgrad * half).square().sum(dim=(0, -1))  # of each view, summed over views
+    torch.testing.assert_close(actual.square_sums, squares, rtol=2e-3, atol=1e-7)
 
 
 def stock(monkeypatch) -> dict:

@@ -35,8 +35,8 @@ _AS_GSPLAT = {"grad2d": "grad_sums", "count": "view_counts"}
 """Keys that gsplat's state has for the same sums."""
 _ANNOUNCEMENTS = {
     "error": f"error-driven, by info['{PREDICTION}'] and info['{GROUND_TRUTH}']",
-    "gradient": f"info has no '{PREDICTION}' and '{GROUND_TRUTH}', so Gaussians are ranked by screen gradients; "
-    "to rank them by error, add before loss.backward(): info.update(prediction=colors, ground_truth=pixels)",
+    "gradient": "driven by squares of screen gradients; to rank Gaussians by error, as the paper does, add before "
+    "loss.backward(): info.update(prediction=colors, ground_truth=pixels)",
 }
 
 
@@ -45,30 +45,34 @@ class TurboDensityStrategy(DefaultStrategy):
     """`ErrorDrivenDensity` behind the protocol of gsplat's strategies.
 
     A subclass of `DefaultStrategy`, since trainers branch on that. Its fields keep their meaning, and may change at any
-    time. Opacities are never reset; reset_every only says when pruning by size begins. grow_scale2d has no effect. The
-    fields below are meant as in `ErrorDrivenDensity`. Their defaults are values of `configs/turbogs.yaml`, but for who
-    grows and goes: there by squares, which gsplat's rasterization does not give.
+    time. Opacities are never reset; reset_every only says when pruning by size begins. grow_scale2d has no effect.
 
-    Once a line ``info.update(prediction=colors, ground_truth=pixels)`` stands before ``loss.backward()``, Gaussians are
-    ranked by the error they carry (see `gaussian_errors`); without it, by their screen gradients. The first step prints
-    which of the two ranks them, and later steps must agree.
+    Gaussians grow and go by `squares`, here the sums of a view's squared absolute screen gradients. As many grow as
+    pass the threshold; which ones is drawn in proportion to squares. Once a line ``info.update(prediction=colors,
+    ground_truth=pixels)`` stands before ``loss.backward()``, Gaussians are ranked by the error they carry (see
+    `gaussian_errors`), as in the paper. The first step prints which of the two it is, and later steps must agree.
+
+    Defaults are values of `configs/turbogs.yaml`. Its share of opacity that an event takes, and of Gaussians, are meant
+    for 33 events; gsplat's 145 events take as much together.
 
     Args:
-        absgrad: also densify by absolute gradients above grow_absgrad2d; render with ``absgrad=True`` then.
-        grow_grad2d, grow_absgrad2d, grow_scale3d: grad_threshold, absgrad_threshold and percent_dense of
-            `ErrorDrivenDensity`.
-        top_fraction, prune_score_fraction, opacity_decay: as of `ErrorDrivenDensity`.
+        absgrad: go by absolute gradients; render with ``absgrad=True`` then. Otherwise by the signed ones.
+        grow_absgrad2d, grow_grad2d: thresholds of a view's mean absolute and signed gradient. By squares one of them
+            counts, as absgrad says; by errors it suffices to pass either.
+        grow_scale3d: percent_dense of `ErrorDrivenDensity`.
+        top_fraction: as of `ErrorDrivenDensity`, by errors alone.
+        prune_score_fraction, opacity_decay: as of `ErrorDrivenDensity`.
         max_gaussians: never more, at any step.
     """
 
     grow_grad2d: float = 2e-4
     grow_scale3d: float = 0.0033
     absgrad: bool = True
-    grow_absgrad2d: float = 2e-4
+    grow_absgrad2d: float = 6e-4
     top_fraction: float = 0.9
     max_gaussians: int = 0
-    prune_score_fraction: float = 0.0
-    opacity_decay: float = 0.4
+    prune_score_fraction: float = 0.012
+    opacity_decay: float = 0.11
 
     def __post_init__(self) -> None:
         require(not self.revised_opacity, "revised_opacity", self.revised_opacity, "False: splits copy the opacity")
@@ -133,7 +137,7 @@ class TurboDensityStrategy(DefaultStrategy):
             window = self._accumulate(state, each, len(gaussians))
         if not infos or step <= self.refine_start_iter or step % self.refine_every:
             return
-        controller = self._controller(step)
+        controller = self._controller(step, state["driven_by"])
         controller.stats = window
         stop = self.refine_stop_iter
         now = Step(step, stop, stop - 1, scene_extent=state["scene_scale"])
@@ -161,11 +165,9 @@ class TurboDensityStrategy(DefaultStrategy):
             remedy = f"put '{PREDICTION}' and '{GROUND_TRUTH}' into info at every step, or at none"
             raise InputError(f"density control was {state['driven_by']}-driven, now {driven_by}-driven: {remedy}")
         if not has_errors:
-            # Ranked by what there is: the mean over views of the screen gradient takes the place of the mean error.
-            stats.error_sums, stats.weight_sums = stats.grad_sums, stats.view_counts
-            stats.distance_sums = torch.zeros_like(stats.grad_sums)
+            stats.weight_sums = stats.view_counts  # by which a Gaussian counts as seen
         if not self.absgrad:
-            stats.absgrad_sums = torch.zeros_like(stats.absgrad_sums)
+            stats.absgrad_sums = stats.grad_sums
         elif getattr(info["means2d"], "absgrad", None) is None:
             raise InputError("info['means2d'] has no absgrad: render with absgrad=True, or use absgrad=False here")
         for name in _STATS:
@@ -177,16 +179,17 @@ class TurboDensityStrategy(DefaultStrategy):
         state.update({key: state[name] for key, name in _AS_GSPLAT.items()})
         return window
 
-    def _controller(self, step: int) -> ErrorDrivenDensity:
+    def _controller(self, step: int, driven_by: str = "gradient") -> ErrorDrivenDensity:
         """The controller with the present values of all fields."""
         same = ("refine_every", "top_fraction", "max_gaussians", "prune_score_fraction", "opacity_decay")
         return ErrorDrivenDensity(
             **{name: getattr(self, name) for name in same},
             refine_from=self.refine_start_iter + 1,
             grad_threshold=self.grow_grad2d,
-            absgrad_threshold=self.grow_absgrad2d,
+            absgrad_threshold=self.grow_absgrad2d if self.absgrad else self.grow_grad2d,
             percent_dense=self.grow_scale3d,
             split="long_axis",
+            choose_by="difficulty" if driven_by == "error" else "squares",
             final_keep=1.0,  # a host's run may end at any step
             prune_opacity=self.prune_opa,
             prune_world_size=self.prune_scale3d,

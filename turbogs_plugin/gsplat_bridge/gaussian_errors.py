@@ -8,7 +8,8 @@ Three sources, best first:
    w = T * alpha the compositing weight; with 1 upstream, the sum of w. No other gradient is touched. The zero channel
    costs one further pass over the tiles, of three channels, as gsplat may be built for chosen numbers of channels and
    always has a colour's. The distance sums stay zero.
-3. Neither: there is no error, only the gradient on the screen.
+3. Neither: there is no error, only the gradient on the screen. The squares of a view's absolute gradients stand for
+   the sums of squares over its samples: both are large where samples of one view want different things.
 """
 
 from __future__ import annotations
@@ -84,7 +85,8 @@ def rows_of(info: dict[str, Any]) -> int | None:
 
 
 def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
-    """Sums of screen gradients, of views and largest radii, in gsplat's units; the sums over pixels stay zero."""
+    """Sums of screen gradients and their squares, of views, and largest radii, in gsplat's units; the sums over pixels
+    stay zero. Squares are of absolute gradients, where the pass has them."""
     require_keys(info, ("means2d", "radii", "width", "height", "n_cameras", "gaussian_ids"), "info", RENDERED)
     means2d, radii, ids = info["means2d"], info["radii"], info["gaussian_ids"]
     if radii.dim() < means2d.dim():  # before gsplat 1.5 both axes have one radius
@@ -107,6 +109,7 @@ def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
     stats, ids = GaussianStats.zeros(count, means2d.device), ids.long()
     stats.grad_sums.index_add_(0, ids, norms[0])
     stats.absgrad_sums.index_add_(0, ids, norms[1])
+    stats.square_sums.index_add_(0, ids, norms[0 if absolute is None else 1].square())
     stats.view_counts.index_add_(0, ids, torch.ones_like(norms[0]))
     stats.max_radii.scatter_reduce_(0, ids, radii.amax(dim=-1).float() / max(width, height), "amax")
     return stats
