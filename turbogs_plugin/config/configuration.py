@@ -194,6 +194,13 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
     return result
 
 
+def refuse_overrides(overrides: Sequence[str], taken: Mapping[str, str]) -> None:
+    """Raise `InputError` for an override of what is `taken`: settings, or whole sections, and why."""
+    for name in (override.partition("=")[0].strip() for override in overrides):
+        if reason := taken.get(name) or taken.get(name.partition(".")[0]):
+            raise InputError(f"{name} is {reason}; leave it out")
+
+
 def settings_named(word: str) -> list[str]:
     """The settings, ``section.key``, that a word may mean: a key, a whole setting, or a kind of strategy."""
     if word in KINDS:
