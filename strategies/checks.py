@@ -21,12 +21,13 @@ def require_settings(instance: Any) -> None:
     hints = get_type_hints(type(instance))
     for name in [field.name for field in fields(instance) if field.init]:
         value, hint = vars(instance)[name], hints[name]
+        real, classed = isinstance(value, Real), hint is bool or is_dataclass(hint)
         if get_origin(hint) is Literal:
             require(value in get_args(hint), name, value, f"one of {', '.join(get_args(hint))}")
         elif hint in (int, float):
-            valid = isinstance(value, Real) and 0 <= value < math.inf and (hint is float or value % 1 == 0)
+            valid = real and 0 <= value < math.inf and (hint is float or value % 1 == 0)
             require(valid, name, value, f"a {'whole' if hint is int else 'finite'} number >= 0")
-        elif hint is bool or is_dataclass(hint):
+        elif classed:
             require(isinstance(value, hint), name, value, f"a {hint.__name__}")
 
 
