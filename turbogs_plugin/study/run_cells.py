@@ -50,8 +50,7 @@ class CellChoice:
     steps: int | None = None
 
     def configs(self, ablation: Ablation, gpus: int = 0) -> dict[CellKey, Config]:
-        """Configuration of each cell, capture after capture and seed after seed. Raises `InputError`, also where this
-        machine has not as many GPUs."""
+        """Configuration of each cell, capture by capture, seed by seed. Raises `InputError`, also for too few GPUs."""
         paths = [path.resolve() for path in self.scenes]
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
             raise InputError(f"seeds: one or more different ones are needed, got {list(self.seeds)}")
@@ -84,15 +83,15 @@ def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | Non
         TrainingStopped: a process was killed.
     """
     folder = StudyFolder(out)
-    folder.require_usable()
+    if not folder.file.is_file() and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"--out '{out}' is not empty and holds no study: choose a new folder")
     configs = choice.configs(ablation, gpus or 0)
     study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
     _require_same(study, ablation, configs)
     folder.write_study(Study(ablation, study.results))
     if there := sum(result.key in configs for result in study.results):
         print(f"kept    {there} of {len(configs)} cells: these were trained before")
-    device = torch.device(next(iter(configs.values())).train.device)
-    here = provenance(device.type)
+    here = provenance(next(iter(configs.values())).train.device)
     try:
         if gpus is None:
             return train_cells(ablation, choice, folder, here)
@@ -150,9 +149,7 @@ def _require_same(study: Study, ablation: Ablation, configs: dict[CellKey, Confi
         asked = flat_settings(configs[result.key].to_mapping())
         changed = [path for path in changes(asked, result.settings) if not path.startswith(OF_A_CALL)]
         if changed:
-            raise InputError(
-                f"the cell '{result.key}' was made with other settings ({', '.join(changed[:4])}): choose a new --out"
-            )
+            raise InputError(f"cell '{result.key}' had other settings ({', '.join(changed[:4])}): choose a new --out")
 
 
 def _train_on_gpus(gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder, Provenance]) -> list[str]:
