@@ -101,6 +101,7 @@ def test_the_base_of_an_ablation_is_looked_for_beside_it(tmp_path, monkeypatch):
         ("title: x\nvariants: {a/b: []}", "a/b"),
         ("title: x\nvariants: {full: []}\nbaseline: ful", "did you mean 'full'"),
         ("variants: {a: []}", "title"),
+        ("title: [x", "ablation '"),
         ("title: x\nvariants: {a: []}\nnotes: {true: b}", "expected text, got True"),
         ("title: x\nvariants: {a: train.seed=1}", "list"),
     ],

@@ -202,8 +202,7 @@ def refuse_overrides(overrides: Sequence[str], taken: Mapping[str, str]) -> None
 
 
 def settings_named(word: str) -> list[str]:
-    """The settings, ``section.key``, that a word may mean: a key, alone or beside its section as in ``time_budget``, or
-    a kind of strategy."""
+    """The settings, ``section.key``, that a word may mean: a key, with its section or alone, or a kind of strategy."""
     if word in KINDS:
         return [f"{word}.type"]
     settings = [(section, key) for section, keys in load_config().to_mapping().items() for key in keys]
