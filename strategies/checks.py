@@ -4,35 +4,38 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
+from numbers import Real
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from torch import Tensor
 
-from turbogs_plugin.errors import InputError, require, require_not_negative
+from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import PixelSamples
 
 
 def require_settings(instance: Any) -> None:
-    """Raise `InputError` where a setting of a strategy breaks the rules that hold for all of them.
-
-    A field of a `Literal` type has one of its values; a number is finite and >= 0. Call it after stricter checks.
+    """Raise `InputError` where a setting of a strategy is of another type, or breaks the rules that hold for all: a
+    field of a `Literal` type has one of its values; a number is finite and >= 0. Call it after stricter checks.
     """
     hints = get_type_hints(type(instance))
     for name in [field.name for field in fields(instance) if field.init]:
-        value = vars(instance)[name]
-        if get_origin(hints[name]) is Literal:
-            allowed = get_args(hints[name])
-            require(value in allowed, name, value, f"one of {', '.join(allowed)}")
-        elif isinstance(value, int | float):
-            require_not_negative(instance, name)
+        value, hint = vars(instance)[name], hints[name]
+        real, classed = isinstance(value, Real), hint is bool or is_dataclass(hint)
+        if get_origin(hint) is Literal:
+            require(value in get_args(hint), name, value, f"one of {', '.join(get_args(hint))}")
+        elif hint in (int, float):
+            valid = real and 0 <= value < math.inf and (hint is float or value % 1 == 0)
+            require(valid, name, value, f"a {'whole' if hint is int else 'finite'} number >= 0")
+        elif classed:
+            require(isinstance(value, hint), name, value, f"a {hint.__name__}")
 
 
 def require_each(instance: Any, valid: Callable[[Any], bool], allowed: str, *names: str) -> None:
-    """Raise `InputError` unless each of these attributes is `valid`; `allowed` describes the valid values."""
+    """Raise `InputError` unless each of these attributes is a `valid` number; `allowed` describes the valid ones."""
     for name in names:
         value = vars(instance)[name]
-        require(valid(value), name, value, allowed)
+        require(isinstance(value, Real) and valid(value), name, value, allowed)
 
 
 def require_at_least_one(instance: Any, *names: str) -> None:

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.rules import STRUCTURE_CONSTANT, LossTerms
-from turbogs_plugin.errors import require
-from turbogs_plugin.strategies.checks import check_colors, require_positive, require_settings
+from turbogs_plugin.strategies.checks import check_colors, require_each, require_positive, require_settings
 from turbogs_plugin.strategies.protocols import SparseLoss
 from turbogs_plugin.types import LossOutput, PixelSamples
 
@@ -100,5 +99,5 @@ class SparseSsimLoss(RuleLoss):
     ssim_weight: float = 0.2
 
     def rule(self) -> LossTerms:
-        require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
+        require_each(self, lambda value: 0 <= value <= 1, "between 0 and 1", "ssim_weight")
         return LossTerms(EPSILON, 1.0 - self.ssim_weight, "ssim", self.ssim_weight)

@@ -13,7 +13,7 @@ from turbogs_plugin.engine import engine_of
 from turbogs_plugin.engine.rules import DrawRule
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.errors import require
-from turbogs_plugin.strategies.checks import require_settings
+from turbogs_plugin.strategies.checks import require_each, require_settings
 from turbogs_plugin.strategies.protocols import PixelSampler
 from turbogs_plugin.tiles import TILE_PIXELS, dense_pixels
 from turbogs_plugin.types import PixelSamples, Step
@@ -97,10 +97,9 @@ class ErrorGuidedPixelSampler(RandomPixelSampler):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(0 <= self.hard_ratio <= 1, "hard_ratio", self.hard_ratio, "between 0 and 1")
+        require_each(self, lambda value: 0 <= value <= 1, "between 0 and 1", "hard_ratio", "importance")
         allowed = f"between 0 and 1 - hard_ratio ({1 - self.hard_ratio:g})"
         require(0 <= self.stable_ratio <= 1 - self.hard_ratio + 1e-9, "stable_ratio", self.stable_ratio, allowed)
-        require(0 <= self.importance <= 1, "importance", self.importance, "between 0 and 1")
         require(not self.importance or self.unit == "pixel", "importance", self.importance, "0 where unit is tile")
 
     @property

@@ -18,8 +18,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from turbogs_plugin.errors import require
-from turbogs_plugin.strategies.checks import require_at_least_one, require_positive, require_settings
+from turbogs_plugin.strategies.checks import require_at_least_one, require_each, require_positive, require_settings
 from turbogs_plugin.types import SamplingBudget, Step
 
 EPSILON = 1e-12
@@ -47,8 +46,7 @@ class SinusoidalSchedule:
 
     def __post_init__(self) -> None:
         require_at_least_one(self, "min_views")
-        allowed = f"min_views ({self.min_views}) or more"
-        require(self.max_views >= self.min_views, "max_views", self.max_views, allowed)
+        require_each(self, lambda value: value >= self.min_views, f"min_views ({self.min_views}) or more", "max_views")
         require_positive(self, "pixel_budget")
         require_settings(self)
 
@@ -106,6 +104,7 @@ class FixedSchedule:
     def __post_init__(self) -> None:
         require_at_least_one(self, "views")
         require_positive(self, "pixel_budget")
+        require_settings(self)
 
     def query(self, step: Step, mean_error: float, initial_error: float, num_views: int) -> SamplingBudget:
         """As of `SinusoidalSchedule.query`; the errors change nothing."""

@@ -289,6 +289,8 @@ def test_a_run_without_a_report_tells_its_model_and_both_clocks(turbogs, capture
         ("train s --out r --iterations 5", "turbogs train: there is no --iterations: write train.iterations=5; see"),
         ("train s --out r --train.seed=5", "turbogs train: there is no --train.seed: write train.seed=5; see"),
         ("train s --out r --pixel-sampler dense", "there is no --pixel-sampler: write pixel_sampler.type=dense; see"),
+        ("ablate parts --out o --time-budget 9s", "ablate: there is no --time-budget: write budget.time=9s; see"),
+        ("ablate parts --out o --seed 1", "ablate: there is no --seed: did you mean '--seeds'?"),
         ("plan iterations=5", "'iterations=5' is not of the form section.key=value: write train.iterations=5"),
         ("plan x train.seed 5", "'train.seed' is not of the form section.key=value: write train.seed=VALUE"),
         ("plan pixel_sampler.tpe=dense", "unknown key 'pixel_sampler.tpe': did you mean 'type'?"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import errno
-import math
 import os
 import signal
 import sys
@@ -27,13 +26,6 @@ def require(valid: bool, field: str, value: object, allowed: str) -> None:
     """Raise `InputError` unless `valid`, with one line: which field, its value, what is allowed."""
     if not valid:
         raise InputError(f"{field} = {value!r} is not valid: it must be {allowed}")
-
-
-def require_not_negative(instance: object, *fields: str) -> None:
-    """Raise `InputError` unless each of these attributes is a finite number >= 0."""
-    for field in fields:
-        value = getattr(instance, field)
-        require(math.isfinite(value) and value >= 0, field, value, "a finite number >= 0")
 
 
 def nearest(name: object, known: Iterable[str]) -> str:

@@ -29,6 +29,7 @@ FLOAT = re.compile(
     re.VERBOSE,
 )
 """A number of YAML 1.2. PyYAML's own rule, of YAML 1.1, takes 1e-4 for text."""
+SYNTAX = "; write one key: value a line, those of a section indented alike by spaces, and close brackets and quotes"
 
 
 class _Loader(yaml.SafeLoader):
@@ -42,7 +43,9 @@ class _Loader(yaml.SafeLoader):
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         result = super().construct_mapping(node, deep)
         if len(result) < len(node.value):
-            raise yaml.constructor.ConstructorError(None, None, "a key is there twice", node.start_mark)
+            keys = [key.value for key, _ in node.value]
+            twice = next((key for at, (key, _) in enumerate(node.value) if key.value in keys[:at]), node)
+            raise yaml.constructor.ConstructorError(None, None, "a key is there twice: keep one", twice.start_mark)
         return result
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
@@ -80,23 +83,23 @@ def read_named_yaml(name_or_file: str, package: str, kind: str) -> dict[str, Any
         return parse_yaml(text, f"{kind} '{name_or_file}'")
     path = Path(name_or_file)
     if path.suffix in (".yaml", ".yml") or path.is_file():
-        return read_yaml(path)
+        return read_yaml(path, kind)
     raise InputError(f"unknown {kind} '{name_or_file}': {nearest(name_or_file, known)}, or a .yaml file")
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path, kind: str = "config") -> dict[str, Any]:
     """The mapping in a YAML file. Raises `InputError`: no such file, too large, no UTF-8, refused by `parse_yaml`."""
     try:
         with open(path, "rb") as file:
             data = file.read(SIZE_LIMIT + 1)
     except OSError as error:
-        raise InputError(f"cannot read config '{path}': {error.strerror}") from None
+        raise InputError(f"cannot read {kind} '{path}': {error.strerror}") from None
     if len(data) > SIZE_LIMIT:
-        raise InputError(f"config '{path}' has more than {SIZE_LIMIT} bytes")
+        raise InputError(f"{kind} '{path}' has more than {SIZE_LIMIT} bytes")
     try:
-        return parse_yaml(data.decode("utf-8"), f"config '{path}'")
+        return parse_yaml(data.decode("utf-8"), f"{kind} '{path}'")
     except UnicodeDecodeError:
-        raise InputError(f"config '{path}' is not UTF-8 text") from None
+        raise InputError(f"{kind} '{path}' is not UTF-8 text") from None
 
 
 def parse_yaml(text: str, where: str) -> dict[str, Any]:
@@ -114,9 +117,13 @@ def _parsed(text: str, where: str) -> dict[str, Any]:
     except InputError:
         raise
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two: digits that Python does not convert
-        mark = error.problem_mark if isinstance(error, yaml.MarkedYAMLError) else None
-        problem = error.problem if isinstance(error, yaml.MarkedYAMLError) else str(error).splitlines()[0]
-        place = f" (line {mark.line + 1})" if mark else ""
+        place, problem = "", str(error).splitlines()[0]
+        if isinstance(error, yaml.MarkedYAMLError):
+            unclosed = re.search("flow|quoted", error.context or "")  # which is told by its beginning
+            mark = error.context_mark if unclosed else error.problem_mark
+            place = f" (line {mark.line + 1})" if mark else ""
+            problem = str(error.problem).replace(r"character '\t' that cannot start any token", "a tab")
+            problem += SYNTAX if isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError) else ""
         raise InputError(f"{where} is not valid YAML{place}: {problem}") from None
 
 
@@ -137,7 +144,7 @@ def _refuse_unsafe(text: str, where: str) -> None:
         raise InputError(f"{where}: expected one YAML document, found {len(roots)}")
     if not isinstance(roots[0], yaml.MappingStartEvent):
         found = f"the text '{roots[0].value[:40]}'" if isinstance(roots[0], yaml.ScalarEvent) else "a list"
-        raise InputError(f"{where}: expected a mapping of sections, got {found}")
+        raise InputError(f"{where}: expected keys and values, as KEY: VALUE, got {found}")
 
 
 def yaml_text(mapping: dict[str, Any]) -> str:

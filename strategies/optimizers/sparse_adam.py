@@ -40,8 +40,8 @@ class SparseAdam:
     moments: GaussianMoments = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        check_moments_config(self.beta1, self.beta2, self.eps)
         require_settings(self)
+        check_moments_config(self.beta1, self.beta2, self.eps)
 
     @property
     def kind(self) -> str:

@@ -110,7 +110,7 @@ REFUSED = [
     ("loss", {"type": "charbonier"}, "did you mean 'charbonnier'"),
     ("losses", {}, "did you mean 'loss'"),
     ("schedule", {"type": "fixed", "view": 1}, "did you mean 'views'"),
-    ("schedule", ["fixed"], "expected a mapping"),
+    ("schedule", ["fixed"], "expected keys and values"),
     ("pixel_sampler", {"type": "no_such_module:X"}, "'no_such_module:X'.*cannot be imported: ModuleNotFoundError"),
     *(("pixel_sampler", {"type": f"third_party:{x}"}, "not a dataclass") for x in ("instance", "Plain")),
     ("pixel_sampler", {"type": "third_party:MySampler", "shar": 1}, "did you mean 'share'"),

@@ -11,7 +11,7 @@ import torch
 from helpers.refusals import assert_one_line
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.captures.colmap import load_pycolmap
+from turbogs_plugin.captures.undistort import load_pycolmap
 from turbogs_plugin.commands.options import GivenOptions
 from turbogs_plugin.engine.render import render_image
 from turbogs_plugin.errors import InputError

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from turbogs_plugin.captures import load_scene, write_demo_capture
-from turbogs_plugin.captures.colmap import load_pycolmap
+from turbogs_plugin.captures.undistort import load_pycolmap
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.engine import Engine
 from turbogs_plugin.scene import Scene

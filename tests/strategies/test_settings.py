@@ -5,11 +5,12 @@ import math
 import pytest
 
 from turbogs_plugin import strategies
+from turbogs_plugin.config.typed import settings_of
 from turbogs_plugin.errors import InputError
 
 REFUSED = {
     "SinusoidalSchedule": ({"min_views": 0}, {"max_views": 2}, {"pixel_budget": math.nan}, {"alpha": -1.0}),
-    "FixedSchedule": ({"views": 0}, {"pixel_budget": 0.0}),
+    "FixedSchedule": ({"views": 0}, {"views": 2.5}, {"pixel_budget": 0.0}),
     "GeometryAwareViewSampler": ({"distance_weight": -1.0},),
     "RandomPixelSampler": ({"unit": "warp"}, {"multiple": 0}, {"multiple": 24}, {"multiple": 512}),
     "ErrorGuidedPixelSampler": (
@@ -37,3 +38,12 @@ def test_impossible_settings_are_refused_by_name(strategy):
     for values in REFUSED[strategy]:
         with pytest.raises(InputError, match=next(iter(values))):
             getattr(strategies, strategy)(**values)
+
+
+@pytest.mark.parametrize("strategy", REFUSED)
+def test_settings_of_another_type_are_refused_by_name(strategy):
+    """Numbers in text, as a script reads them from its arguments or from a file."""
+    for name in settings_of(cls := getattr(strategies, strategy)):
+        for wrong in ("3", None, [1.0]):
+            with pytest.raises(InputError, match=f"^{name} = .* must be "):
+                cls(**{name: wrong})

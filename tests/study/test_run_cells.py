@@ -251,6 +251,7 @@ def test_a_cell_has_the_planned_length_and_keeps_a_cap_on_gaussians(tmp_path, mo
         ("ablate components --scene CAPTURE --out X --seeds 1 --seeds 2", "--seeds is given twice"),
         ("ablate components --scene CAPTURE --scene CAPTURE --out X", "are called the same"),
         ("ablate components --scene CAPTURE --out X --gpus 0", "--gpus 0"),
+        ("ablate components --scene CAPTURE --out X --gpus 999", "--gpus 999"),
         ("ablate components train.seed=5 --scene CAPTURE --out X", "train.seed is given by --seeds"),
         ("ablate components budget.time=1s --scene CAPTURE --out X --steps 4", "time budget 1s exclude each other"),
         ("ablate components budget.max_memory=2GiB --scene CAPTURE --out X", "max_memory limits a whole process"),

@@ -101,6 +101,7 @@ def test_the_base_of_an_ablation_is_looked_for_beside_it(tmp_path, monkeypatch):
         ("title: x\nvariants: {a/b: []}", "a/b"),
         ("title: x\nvariants: {full: []}\nbaseline: ful", "did you mean 'full'"),
         ("variants: {a: []}", "title"),
+        ("title: [x", "ablation '"),
         ("title: x\nvariants: {a: []}\nnotes: {true: b}", "expected text, got True"),
         ("title: x\nvariants: {a: train.seed=1}", "list"),
     ],
@@ -113,9 +114,10 @@ def test_a_bad_ablation_is_refused(tmp_path, text, word):
 
 
 def test_a_variant_that_does_not_resolve_is_named():
-    ablation = Ablation("x", {"good": [], "bad": ["loss.nonsense=1"]})
-    with pytest.raises(InputError, match=r"variant 'bad'.*nonsense"):
-        variant_config(ablation, "bad", 0, (), None)
+    ablation = Ablation("x", {"good": [], "bad": ["loss.nonsense=1"], "seeded": ["train.seed =1"]})
+    for name, words in (("bad", "nonsense"), ("seeded", "train.seed is given by --seeds")):
+        with pytest.raises(InputError, match=f"variant '{name}'.*{words}"):
+            variant_config(ablation, name, 0, (), None)
 
 
 def test_a_number_of_steps_and_a_time_budget_exclude_each_other():

@@ -16,7 +16,7 @@ from helpers.refusals import assert_one_line
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from turbogs_plugin.captures.colmap import load_pycolmap
+from turbogs_plugin.captures.undistort import load_pycolmap
 from turbogs_plugin.commands.options import GivenOptions
 from turbogs_plugin.engine.reference.projection import drawable_rows, project_rows
 from turbogs_plugin.engine.render import render_image

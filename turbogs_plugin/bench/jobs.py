@@ -45,10 +45,8 @@ def time_engine(
     return {"model": ply.name, **bench_raster(capture, models, views, repeats)}
 
 
-def require_result_file(out: Path | None) -> None:
+def require_result_file(out: Path) -> None:
     """Raise `InputError` before anything is measured, where no file of the result can be made or replaced."""
-    if out is None:
-        return
     if out.is_dir() or not out.absolute().parent.is_dir():
         raise InputError(f"--out '{out}': name a file in a folder that exists")
     require_writable(out.parent, f"--out '{out}'")

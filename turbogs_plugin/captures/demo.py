@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from turbogs_plugin.captures.colmap import load_pycolmap, write_whole
+from turbogs_plugin.captures.colmap import write_whole
+from turbogs_plugin.captures.undistort import load_pycolmap
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import look_at
 

@@ -115,8 +115,7 @@ def _lens(model: str, size: tuple[int, int], params: tuple[float, ...]) -> Lens 
 
 
 def _options() -> pycolmap.UndistortCameraOptions:
-    pycolmap = load_pycolmap()
-    return pycolmap.UndistortCameraOptions(blank_pixels=0.0, max_scale=LARGEST_GROWTH, max_cam_point_norm=WIDEST)
+    return load_pycolmap().UndistortCameraOptions(blank_pixels=0.0, max_scale=LARGEST_GROWTH, max_cam_point_norm=WIDEST)
 
 
 def undistortion_note(lenses: Sequence[Lens | None]) -> str:

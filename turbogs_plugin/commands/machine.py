@@ -47,7 +47,8 @@ def bench(
     for name, values in {"gaussians": gaussians, "views": views, "repeats": (times,)}.items():
         require_positive(f"--{name}", *(values or (0,)))
     where = resolve_device(load_config(overrides=overrides).train.device)
-    jobs.require_result_file(out)
+    if out is not None:
+        jobs.require_result_file(out)
     if what == "wall":
         if ply is not None:
             raise InputError("bench wall times whole trainings: leave --ply out")

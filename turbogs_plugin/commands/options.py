@@ -52,11 +52,10 @@ class RunOptions:
 
     def settings(self, scene: Path | None, overrides: tuple[str, ...]) -> Config:
         """The configuration that a command line asks for. No scene leaves the capture open."""
-        from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config
+        from turbogs_plugin.config.configuration import DEFAULT_CONFIG, load_config, refuse_overrides
         from turbogs_plugin.plan.memory import with_cap
 
-        if any(override.partition("=")[0].strip() == "scene.path" for override in overrides):
-            raise InputError("scene.path is what SCENE says: leave the override out")
+        refuse_overrides(overrides, {"scene.path": "what SCENE says"})
         require_positive("--max-gaussians", self.max_gaussians)
         given = {"scene.factor": self.factor, "train.device": self.device, "train.init": self.init}
         given |= {"budget.max_memory": self.max_memory, "budget.time": self.time_budget}

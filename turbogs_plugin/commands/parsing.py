@@ -84,8 +84,8 @@ def _mistake(event: tyro_errors.ParseErrorEvent) -> str:
 
 
 def _unknown_option(function: Command, words: Sequence[str]) -> str:
-    """What to write for the first option that the command does not have: a setting of that name, or the nearest
-    option; empty where it has all of them."""
+    """What to write for the first option that the command does not have: the option that begins so, a setting of that
+    name, or the nearest option; empty where it has all of them."""
     known = {"help"}
     for name, parameter in signature(function).parameters.items():
         if is_dataclass(parameter.default):
@@ -102,7 +102,8 @@ def _unknown_option(function: Command, words: Sequence[str]) -> str:
             from turbogs_plugin.config.configuration import settings_named
 
             said = value if equals else "" if behind.startswith("--") else behind
-            settings = [f"{setting}={said or 'VALUE'}" for setting in settings_named(name)]
+            beginning = any(entry.startswith(name) for entry in known)
+            settings = [] if beginning else [f"{setting}={said or 'VALUE'}" for setting in settings_named(name)]
             remedy = f"write {' or '.join(settings)}" if settings else remedy
         return f"there is no {option}: {remedy}"
     return ""

@@ -89,9 +89,7 @@ def build(kind: str, mapping: Any) -> Any:
     a wrong type of a value, one out of range, or a class without what its kind's protocol has."""
     if kind not in TYPES:
         raise InputError(f"unknown kind of strategy '{kind}': {nearest(kind, KINDS)}")
-    if not isinstance(mapping, Mapping):
-        raise InputError(f"{kind}: expected a mapping with a 'type', got {mapping!r}")
-    type_name = mapping.get("type", default_type(kind))
+    type_name = mapping.get("type", default_type(kind)) if isinstance(mapping, Mapping) else default_type(kind)
     strategy: Any = build_dataclass(strategy_class(kind, type_name), mapping, kind, apart=("type",))
     return completed(kind, strategy, f"{kind}.type '{type_name}'")
 

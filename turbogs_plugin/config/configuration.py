@@ -194,13 +194,19 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
     return result
 
 
+def refuse_overrides(overrides: Sequence[str], taken: Mapping[str, str]) -> None:
+    """Raise `InputError` for an override of what is `taken`: settings, or whole sections, and why."""
+    for name in (override.partition("=")[0].strip() for override in overrides):
+        if reason := taken.get(name) or taken.get(name.partition(".")[0]):
+            raise InputError(f"{name} is {reason}; leave it out")
+
+
 def settings_named(word: str) -> list[str]:
-    """The settings, ``section.key``, that a word may mean: a key, a whole setting, or a kind of strategy."""
+    """The settings, ``section.key``, that a word may mean: a key, with its section or alone, or a kind of strategy."""
     if word in KINDS:
         return [f"{word}.type"]
-    given, _, key = word.rpartition(".")
-    sections = load_config().to_mapping().items()
-    return [f"{section}.{key}" for section, keys in sections if key in keys and given in ("", section)]
+    settings = [(section, key) for section, keys in load_config().to_mapping().items() for key in keys]
+    return [f"{s}.{key}" for s, key in settings if word in (key, f"{s}.{key}", f"{s}_{key}", f"{key}_{s}")]
 
 
 def _load_mapping(name_or_file: str, depth: int = 0) -> dict[str, Any]:

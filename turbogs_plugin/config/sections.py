@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from PIL import ImageColor
 
-from turbogs_plugin.errors import InputError, require, require_not_negative
+from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import Color
 
 AUTO = "auto"
@@ -151,7 +151,7 @@ class TrainConfig:
         require(0 < self.initial_size <= 100, "initial_size", self.initial_size, "more than 0 and at most 100")
         share = isinstance(self.dropout, str) or 0 <= self.dropout < 1
         require(share, "dropout", self.dropout, "at least 0, less than 1")
-        require_not_negative(self, "distant_size")
+        require(0 <= self.distant_size < math.inf, "distant_size", self.distant_size, "a finite number >= 0")
         require(0 <= self.average_last <= 1, "average_last", self.average_last, "within 0 .. 1")
         for value in self.evaluate_at:
             require(0 < value <= 1, "evaluate_at", value, "fractions within (0, 1]")

@@ -17,6 +17,7 @@ from functools import cache
 from typing import Any, Literal, TypeVar
 
 from turbogs_plugin.errors import InputError, nearest
+from turbogs_plugin.yaml_json import FLOAT
 
 T = TypeVar("T")
 UNIONS = (typing.Union, types.UnionType)
@@ -35,7 +36,7 @@ def build_dataclass(cls: type[T], mapping: Any, where: str, apart: Collection[st
     are the caller's. Raises `InputError`: an unknown key (naming the nearest), a missing one, a wrong type, or a value
     that the dataclass itself refuses."""
     if not isinstance(mapping, Mapping):
-        raise InputError(f"{where}: expected a mapping of keys, got {mapping!r}")
+        raise InputError(f"{where}: expected {_named(dict)}, got {mapping!r}")
     try:
         hints = _type_hints(cls)
     except Exception as error:  # whatever the names of a third party's types lead to
@@ -101,7 +102,8 @@ def convert(value: Any, hint: Any, where: str) -> Any:
             return value
     elif hint not in NAMES or isinstance(value, hint):
         return value
-    raise InputError(f"{where}: expected {_named(hint)}, got {value!r}")
+    quoted = isinstance(value, str) and FLOAT.match(value)
+    raise InputError(f"{where}: expected {_named(hint)}, got {value!r}{': leave out its quotes' if quoted else ''}")
 
 
 def _named(hint: Any) -> str:
@@ -113,4 +115,4 @@ def _named(hint: Any) -> str:
         return " or ".join(map(str, arguments))
     if origin in (tuple, list):
         return "a list, as [A, B]"
-    return NAMES.get(hint, "a mapping of keys")
+    return NAMES.get(hint, "keys and values, as {KEY: VALUE} or each in a line of its own")

@@ -44,6 +44,13 @@ def restarts() -> int:
     return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
 
 
+def require_gpus(count: int, device: str) -> None:
+    """Raise `InputError` where fewer GPUs answer, unless processes are to train on the CPU."""
+    if device != "cpu" and (present := torch.cuda.device_count()) < count:
+        remedy = "ask for as many" if present else "leave it out to train on the CPU"
+        raise InputError(f"--gpus {count}: {present or 'no'} GPUs answer here; {remedy}, or see 'turbogs doctor'")
+
+
 def start(count: int, arguments: Sequence[str], device: str = "auto", module: str = "turbogs_plugin") -> int:
     """Start `count` processes of the `turbogs` command on this machine, as torchrun does, and wait for them. Returns
     the exit code: 0, or the code of the process that ended first with an error, which says itself why.
@@ -61,9 +68,7 @@ def start(count: int, arguments: Sequence[str], device: str = "auto", module: st
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
-    present = torch.cuda.device_count()
-    if device != "cpu" and present < count:
-        raise InputError(f"--gpus {count}: {present} GPUs answer here; ask for as many, or see 'turbogs doctor'")
+    require_gpus(count, device)
     logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)  # the processes say what happened
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, processor_cores() // count)))
     os.environ.setdefault("PYTHONSAFEPATH", "1")  # else "-m" imports modules of the current folder first

@@ -136,8 +136,7 @@ def contributions(gaussians: Gaussians, cameras: Cameras, settings: RasterSettin
     for view in range(len(cameras)):
         samples = dense_samples(cameras, [view])
         rendered = rasterize(gaussians, cameras.select([view]), samples, sh_degree=0, settings=settings)
-        screen = rendered.backward(torch.zeros_like(rendered.colors))
-        sums += screen.full_records()[0, :, ScreenRecord.WEIGHT_SUM]
+        sums += rendered.backward(torch.zeros_like(rendered.colors)).full_records()[0, :, ScreenRecord.WEIGHT_SUM]
     return sums
 
 

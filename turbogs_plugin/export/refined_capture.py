@@ -24,8 +24,9 @@ from turbogs_plugin.captures.bundle_adjustment import (
     refine_together,
 )
 from turbogs_plugin.captures.capture import Capture
-from turbogs_plugin.captures.colmap import find_model, load_pycolmap, read_colmap, read_reconstruction, write_whole
+from turbogs_plugin.captures.colmap import find_model, read_colmap, read_reconstruction, write_whole
 from turbogs_plugin.captures.mask_files import FOLDER as MASKS
+from turbogs_plugin.captures.undistort import load_pycolmap
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
 

@@ -13,7 +13,7 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from torch import Tensor
 
-from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config
+from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, refuse_overrides
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.error_maps import LaggedCopy
 from turbogs_plugin.errors import InputError, require
@@ -47,9 +47,9 @@ WITHOUT_EFFECT: dict[str, Any] = {**IN_IMAGES, **dict.fromkeys(_STEP.split(" "),
 _START = "train.init train.init_world train.sh_degree train.initial_opacity train.initial_size train.device"
 _AROUND = "scene train.seed train.refine_cameras train.evaluate_at train.checkpoint_every budget.time"
 OWN_SETTINGS: dict[str, str] = {
-    "train.exposure": "a host's evaluation has no exposures",
-    **dict.fromkeys(_START.split(" "), "splats decide"),
-    **dict.fromkeys(_AROUND.split(" "), "views, torch.manual_seed and all around a step are the host's"),
+    "train.exposure": "TurboStep's own: a host's evaluation has no exposures",
+    **dict.fromkeys(_START.split(" "), "TurboStep's own: splats decide"),
+    **dict.fromkeys(_AROUND.split(" "), "TurboStep's own: views, torch.manual_seed and all around it are the host's"),
 }
 """Settings, or whole sections, that no override can change, and why."""
 LAG = 16
@@ -327,9 +327,7 @@ class HostRates(LearningRates):
 def host_settings(config: str, overrides: Sequence[str]) -> Config:
     """The settings of a training in a host. Raises `InputError` for an override of one of `OWN_SETTINGS`."""
     overrides = [overrides] if isinstance(overrides, str) else list(overrides)
-    for name in [override.partition("=")[0].strip() for override in overrides]:
-        if reason := OWN_SETTINGS.get(name) or OWN_SETTINGS.get(name.partition(".")[0]):
-            raise InputError(f"{name} is TurboStep's own: {reason}; leave it out of overrides")
+    refuse_overrides(overrides, OWN_SETTINGS)
     return load_config(config, (*overrides, "train.exposure=false", "train.init=points"))
 
 

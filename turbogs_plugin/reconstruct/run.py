@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 from filelock import FileLock
 
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, named
-from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.captures.load import other_poses
 from turbogs_plugin.captures.photo_files import find_photos, unread
+from turbogs_plugin.captures.undistort import load_pycolmap
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text, require_writable, write_text_atomically
 from turbogs_plugin.reconstruct import solver

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from turbogs_plugin.captures.colmap import load_pycolmap
 from turbogs_plugin.captures.matches import EPIPOLAR_SHARE, epipolar_distances
+from turbogs_plugin.captures.undistort import load_pycolmap
 from turbogs_plugin.reconstruct.ghosts import Agreement
 from turbogs_plugin.reconstruct.photos import PhotoFile
 

@@ -28,25 +28,34 @@ another light. The view sampler `random` takes each in one of five rounds."""
 def write_report(run: RunSession) -> Path:
     """Write ``report.md``, the page that is given back, and its pictures (in ``report/``) into the run's folder."""
     trainer = run.trainer
-    look = trainer.look(run.test.names)
     lpips, lpips_reason = load_lpips(trainer.device)
     metrics = None if lpips else run.evaluations.metrics  # of the end
     if metrics is None:
-        metrics = evaluate(trainer.gaussians, run.test, look, lpips, further=True)
+        metrics = evaluate(trainer.gaussians, run.test, trainer.look(run.test.names), lpips, further=True)
     run.clock.mark("report")
-    pictures = run.folder.path / "report"
-    pictures.mkdir(exist_ok=True)
-    strips = min(len(run.test), STRIPS)
     view_errors = trainer.maps.view_means()
     worst = [int(view) for view in np.argsort(-view_errors)[:STRIPS] if doubted(view_errors)[view]]
-    shown = [("test", run.test, look, list(range(strips)))]
-    shown += [("doubted", trainer.views, trainer.look(trainer.views.names), worst)] if worst else []
+    strips = min(len(run.test), STRIPS)
+    _write_pictures(run, strips, worst)
+    run.clock.mark("pictures and plots")
+    times = {view: view_errors[view] / np.median(view_errors) for view in worst}
+    write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, strips, times))
+    run.clock.mark("report")
+    return run.folder.report
+
+
+def _write_pictures(run: RunSession, strips: int, worst: list[int]) -> None:
+    """Write the page's pictures: the first test views, the training photos that were doubted, and the plots."""
+    pictures, trainer = run.folder.path / "report", run.trainer
+    pictures.mkdir(exist_ok=True)
+    shown = [("test", run.test, list(range(strips)))] + ([("doubted", trainer.views, worst)] if worst else [])
     with ThreadPoolExecutor() as pool:  # pictures are encoded while others are rendered and plots are drawn
         encoded = []
-        for kind, views, seen, view_ids in shown:
+        for kind, views, view_ids in shown:
+            look = trainer.look(views.names)
             for view_id in view_ids:
-                image = render_view(trainer.gaussians, views, view_id, seen)
-                pixels = strip(views.photos.image(view_id, seen.background), image, views.mask(view_id)).cpu().numpy()
+                image = render_view(trainer.gaussians, views, view_id, look)
+                pixels = strip(views.photos.image(view_id, look.background), image, views.mask(view_id)).cpu().numpy()
                 encoded.append(pool.submit(save_image, pictures / f"{kind}-{view_id:03d}.jpg", titled(pixels)))
         from turbogs_plugin.report.curves import plot_against_seconds  # loads matplotlib
 
@@ -56,11 +65,6 @@ def write_report(run: RunSession) -> Path:
             plot_against_seconds(pictures / f"{name}.png", seconds, values, label, run.scene.name)
         for picture in encoded:
             picture.result()
-    run.clock.mark("pictures and plots")
-    times = {view: view_errors[view] / np.median(view_errors) for view in worst}
-    write_text_atomically(run.folder.report, _page(run, metrics, lpips_reason, strips, times))
-    run.clock.mark("report")
-    return run.folder.report
 
 
 def _page(run: RunSession, metrics: Metrics, lpips_reason: str, shown: int, doubts: dict[int, float]) -> str:

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from turbogs_plugin.config.configuration import Config, load_config, named_beside
+from turbogs_plugin.config.configuration import Config, load_config, named_beside, refuse_overrides
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.config.typed import build_dataclass
 from turbogs_plugin.errors import InputError, nearest
@@ -26,8 +26,8 @@ from turbogs_plugin.yaml_json import read_named_yaml
 PACKAGE = "turbogs_plugin.configs.ablations"
 """Where the packaged ablations are."""
 
-GIVEN = {"train.seed": "--seeds", "scene.path": "--scene"}
-"""Setting -> the option of a study that gives it."""
+GIVEN = {"train.seed": "given by --seeds", "scene.path": "given by --scene"}
+"""Settings that no variant can change, and why."""
 
 _NAME = re.compile(r"[A-Za-z0-9+][A-Za-z0-9_+.-]{0,47}")
 
@@ -109,9 +109,7 @@ def variant_config(ablation: Ablation, variant: str, seed: int, overrides: Seque
     """
     try:
         changes = [*ablation.variants[variant], *overrides]
-        for setting in (change.partition("=")[0] for change in changes):
-            if setting in GIVEN:
-                raise InputError(f"{setting} is given by {GIVEN[setting]}: leave it out")
+        refuse_overrides(changes, GIVEN)
         config = load_config(ablation.base, [*changes, f"train.seed={seed}"])
         if config.budget.max_memory:
             limits = "budget.max_memory limits a whole process, which here trains all cells"

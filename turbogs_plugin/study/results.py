@@ -135,12 +135,6 @@ class StudyFolder:
         self.file = path / "results.json"
         self.cells = path / "cells"
 
-    def require_usable(self) -> None:
-        """Raise `InputError` where the folder holds anything but a study, or cannot be one."""
-        taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
-        if taken and not self.file.is_file():
-            raise InputError(f"--out '{self.path}' is not empty and holds no study: choose a new folder")
-
     def write(self, result: CellResult) -> None:
         """Keep a cell's result, as a study of that cell alone."""
         path = self.cells / result.key.file

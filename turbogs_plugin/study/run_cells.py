@@ -25,7 +25,7 @@ import torch
 from turbogs_plugin.config.configuration import Config
 from turbogs_plugin.config.sections import SceneConfig
 from turbogs_plugin.device import free_device_memory, processor_cores
-from turbogs_plugin.distributed.processes import end_with_parent
+from turbogs_plugin.distributed.processes import end_with_parent, require_gpus
 from turbogs_plugin.errors import InputError, TrainingStopped
 from turbogs_plugin.report.provenance import Provenance, provenance
 from turbogs_plugin.scene import Scene
@@ -49,8 +49,8 @@ class CellChoice:
     overrides: Sequence[str] = ()
     steps: int | None = None
 
-    def configs(self, ablation: Ablation) -> dict[CellKey, Config]:
-        """Configuration of each cell, capture after capture and seed after seed. Raises `InputError`."""
+    def configs(self, ablation: Ablation, gpus: int = 0) -> dict[CellKey, Config]:
+        """Configuration of each cell, capture by capture, seed by seed. Raises `InputError`, also for too few GPUs."""
         paths = [path.resolve() for path in self.scenes]
         if not self.seeds or len(set(self.seeds)) != len(self.seeds):
             raise InputError(f"seeds: one or more different ones are needed, got {list(self.seeds)}")
@@ -62,6 +62,7 @@ class CellChoice:
         configs: dict[CellKey, Config] = {}
         for path, seed, variant in itertools.product(paths, self.seeds, ablation.only(self.only)):
             config = variant_config(ablation, variant, seed, self.overrides, self.steps)
+            require_gpus(gpus, config.train.device)
             config.scene.path, config.train.device = str(path), resolve_device(config.train.device).type
             configs[CellKey(path.name, variant, seed)] = config
             shared = next(iter(configs.values())).scene
@@ -82,17 +83,15 @@ def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | Non
         TrainingStopped: a process was killed.
     """
     folder = StudyFolder(out)
-    folder.require_usable()
-    configs = choice.configs(ablation)
+    if not folder.file.is_file() and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"--out '{out}' is not empty and holds no study: choose a new folder")
+    configs = choice.configs(ablation, gpus or 0)
     study = folder.read_study() if folder.file.is_file() else Study(ablation, [])
     _require_same(study, ablation, configs)
     folder.write_study(Study(ablation, study.results))
     if there := sum(result.key in configs for result in study.results):
         print(f"kept    {there} of {len(configs)} cells: these were trained before")
-    device = torch.device(next(iter(configs.values())).train.device)
-    if gpus is not None and device.type != "cpu" and gpus > torch.cuda.device_count():
-        raise InputError(f"--gpus {gpus}: this machine has {torch.cuda.device_count()}; see 'turbogs doctor'")
-    here = provenance(device.type)
+    here = provenance(next(iter(configs.values())).train.device)
     try:
         if gpus is None:
             return train_cells(ablation, choice, folder, here)
@@ -150,9 +149,7 @@ def _require_same(study: Study, ablation: Ablation, configs: dict[CellKey, Confi
         asked = flat_settings(configs[result.key].to_mapping())
         changed = [path for path in changes(asked, result.settings) if not path.startswith(OF_A_CALL)]
         if changed:
-            raise InputError(
-                f"the cell '{result.key}' was made with other settings ({', '.join(changed[:4])}): choose a new --out"
-            )
+            raise InputError(f"cell '{result.key}' had other settings ({', '.join(changed[:4])}): choose a new --out")
 
 
 def _train_on_gpus(gpus: int, arguments: tuple[Ablation, CellChoice, StudyFolder, Provenance]) -> list[str]:
