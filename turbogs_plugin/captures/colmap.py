@@ -14,7 +14,7 @@ from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, named, text_
 from turbogs_plugin.captures.colmap_files import CLOUD, FILES, ColmapModel, ModelImage, read_model
 from turbogs_plugin.captures.photo_files import IMAGES, find_named
 from turbogs_plugin.captures.starting_points import clouds_beside
-from turbogs_plugin.captures.undistort import Lens, lens_of_camera, load_pycolmap
+from turbogs_plugin.captures.undistort import Lens, lens_of_camera
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types.cameras import Observations
 
@@ -122,19 +122,6 @@ def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict
         known = np.isfinite(pixels).all(axis=1) & (ids[points.clip(max=len(ids) - 1)] == shown["point"])
         parts.append((pixels[known], np.full(known.sum(), view), points[known]))
     return Observations(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-
-def read_reconstruction(folder: Path, suffix: str) -> pycolmap.Reconstruction:
-    """What `read_colmap` has read, as pycolmap reads it, with whole names. Raises `InputError` where it cannot."""
-    reconstruction = load_pycolmap().Reconstruction()
-    try:
-        (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(folder)
-    except Exception as error:  # pycolmap raises whatever C++ threw
-        raise InputError(f"{folder}: pycolmap cannot read this reconstruction; copy or reconstruct it again") from error
-    for image in read_model(folder, suffix).images:  # pycolmap cuts a name in text at its first space
-        if image.number in reconstruction.images:
-            reconstruction.images[image.number].name = image.name.replace("\\", "/")
-    return reconstruction
 
 
 def write_whole(reconstruction: pycolmap.Reconstruction, folder: Path, called: Path) -> None:
