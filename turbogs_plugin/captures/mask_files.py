@@ -103,7 +103,7 @@ def load_masks(
         if keep.all():
             return None
         if lens is not None:
-            keep = np.asarray(lens.undistort(_image(keep))) == 255
+            keep = np.asarray(lens.undistort(Image.fromarray(keep).convert("L"))) == 255
         return PixelMasks.of(_reduced(keep, target))
 
     with decoding_threads() as pool:
@@ -121,7 +121,7 @@ def _read(file: Path, photo: Path, size: Size, full_size: Size) -> np.ndarray:
         if values.ndim == 3 and image.mode in ("LA", "RGBA"):
             values = values[:, :, :-1] * (values[:, :, -1:] > 0)
         keep = (values.reshape(*values.shape[:2], -1) >= least).any(axis=2)
-    return _reduced(np.asarray(keep), size)
+    return _reduced(keep, size)
 
 
 def require_mask_size(file: Path, mask_size: Size, photo: Path, size: Size, other: Size) -> None:
@@ -132,12 +132,6 @@ def require_mask_size(file: Path, mask_size: Size, photo: Path, size: Size, othe
         raise InputError(f"mask {file} is {mask} but photo {photo} is {wanted}: {remedy}")
 
 
-def _image(keep: np.ndarray) -> Image.Image:
-    """An image that is white where [H, W] bool is True, and black elsewhere."""
-    return Image.fromarray(np.where(keep, np.uint8(255), np.uint8(0)))
-
-
 def _reduced(keep: np.ndarray, size: Size) -> np.ndarray:
     """[H, W] bool of `size` (width, height): True where all that a pixel is made of is True."""
-    image = _image(keep)
-    return np.asarray(image if image.size == size else image.resize(size, Image.Resampling.BOX)) == 255
+    return np.asarray(Image.fromarray(keep).convert("L").resize(size, Image.Resampling.BOX)) == 255
