@@ -155,7 +155,7 @@ REFUSED = [
     (lambda capture: capture / "absent", "absent has no COLMAP reconstruction .* by  turbogs reconstruct", "new"),
     (without_points, "sparse/0 has no points that its photos show", "new"),
     (with_distortion, r"6 of 6 cameras have distortion \(OPENCV\)", "new"),
-    (with_other_features, r"half of its points are more than 12.8 pixels \(2% of .*: reconstruct the photos", "new"),
+    (with_other_features, "half of its points are over 2% of a photo.* show them: reconstruct the", "new"),
     (Path, "--out .*new' would lie among the photos of .*images': choose another folder", "cup/images/new"),
     (Path, r"--out .*new' cannot be made in .* \(not a folder\): choose a folder to write", "cup/images/00.png/new"),
 ]

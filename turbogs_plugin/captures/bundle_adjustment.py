@@ -128,15 +128,11 @@ def reprojection_errors(cameras: Pinholes, points: np.ndarray, observations: Obs
     return _Adjustment(cameras, points, observations).first_errors
 
 
-def farthest_match(cameras: Pinholes) -> float:
-    """`FARTHEST_MATCH` in pixels."""
-    return FARTHEST_MATCH * 2.0 * float(np.median(cameras.half_widths))
-
-
 def of_these_photos(cameras: Pinholes, points: np.ndarray, observations: Observations) -> bool:
     """True where observations belong to the photos of these cameras, not to others or to another size: half of the
-    points are within `farthest_match`."""
-    return _median(reprojection_errors(cameras, points, observations)) <= farthest_match(cameras)
+    points are within `FARTHEST_MATCH`."""
+    width = 2.0 * float(np.median(cameras.half_widths))
+    return _median(reprojection_errors(cameras, points, observations)) <= FARTHEST_MATCH * width
 
 
 class _Adjustment:

@@ -19,7 +19,6 @@ from turbogs_plugin.captures.bundle_adjustment import (
     FARTHEST_MATCH,
     Pinholes,
     Refinement,
-    farthest_match,
     of_these_photos,
     refine_together,
 )
@@ -70,8 +69,7 @@ def write_refined(scene: Path, out: Path) -> str:
         raise InputError(f"--out '{out}' would lie among the photos of '{capture.photo_folder}': choose another folder")
     given = Pinholes.of(capture.viewmats, capture.Ks, capture.sizes)
     if not of_these_photos(given, capture.points, observations):
-        far = f"more than {farthest_match(given):.1f} pixels ({FARTHEST_MATCH:.0%} of a photo's width)"
-        trouble = f"half of its points are {far} from where its photos show them"
+        trouble = f"half of its points are over {FARTHEST_MATCH:.0%} of a photo's width from where photos show them"
         raise InputError(f"{found[0]}: {trouble}: reconstruct the photos again")
     refined = refine_together(given, capture.points, observations)
     out.parent.mkdir(parents=True, exist_ok=True)
