@@ -121,7 +121,7 @@ def _read(file: Path, photo: Path, size: Size, full_size: Size) -> np.ndarray:
         if values.ndim == 3 and image.mode in ("LA", "RGBA"):
             values = values[:, :, :-1] * (values[:, :, -1:] > 0)
         keep = (values.reshape(*values.shape[:2], -1) >= least).any(axis=2)
-    return _reduced(keep, size)
+    return _reduced(np.asarray(keep), size)
 
 
 def require_mask_size(file: Path, mask_size: Size, photo: Path, size: Size, other: Size) -> None:
