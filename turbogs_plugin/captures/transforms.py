@@ -19,7 +19,7 @@ from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, text_of
 from turbogs_plugin.captures.decoding import photo_size
 from turbogs_plugin.captures.photo_files import file_named, find_named
 from turbogs_plugin.captures.starting_points import clouds_beside, read_cloud
-from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens, lens_of_camera, load_pycolmap
+from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens, load_pycolmap, pinhole_of_camera
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.agreement import OTHER_AXES
 from turbogs_plugin.scene.geometry import viewmat_of_pose
@@ -204,8 +204,7 @@ def _read_camera(values: Frame, photo: Path, source: Path) -> tuple[np.ndarray, 
     kind = model if model == FISHEYE else "FULL_OPENCV" if bends["k3"] else "OPENCV"
     keys = {FISHEYE: known, "FULL_OPENCV": BENDS, "OPENCV": BENDS[:4]}[kind]
     params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *(bends[key] for key in keys)]
-    lens = lens_of_camera(load_pycolmap().Camera(model=kind, width=size[0], height=size[1], params=params), owner)
-    return (K, size, None) if lens is None else (lens.K, lens.size, lens)
+    return pinhole_of_camera(load_pycolmap().Camera(model=kind, width=size[0], height=size[1], params=params), owner)
 
 
 def pinhole(values: Mapping[str, Any], source: Path, size: tuple[float, float]) -> np.ndarray | None:
