@@ -49,10 +49,9 @@ def find_masks(scene: Path, capture: Capture, photos: Sequence[Path]) -> tuple[l
 
 
 def _misnamed(parents: Iterable[Path]) -> str:
-    """A note on the first folder of images in these that is called like one of masks, and not `FOLDER`; or empty."""
+    """A note on the first folder of images that is called like one of masks in these, without a `FOLDER`; or empty."""
     for folder in (entry for parent in parents if parent.is_dir() for entry in sorted(parent.iterdir())):
-        called = re.fullmatch(photo_files.MASKS, folder.name, re.IGNORECASE) and folder.name != FOLDER
-        if called and photo_files.find_photos(folder)[1]:
+        if re.fullmatch(photo_files.MASKS, folder.name, re.IGNORECASE) and photo_files.find_photos(folder)[1]:
             return f"{folder} is not used: masks are read from {FOLDER}/; rename it if it holds the photos' masks"
     return ""
 
@@ -115,10 +114,10 @@ def _read(file: Path, photo: Path, size: Size, full_size: Size) -> np.ndarray:
     with opened_image(file, "mask", pixels=MASK_PIXELS * size[0] * size[1]) as image:
         require_mask_size(file, image.size, photo, size, full_size)
         if image.mode == "P":
-            image = image.convert("RGBA" if is_transparent(image) else "RGB")
+            image = image.convert("RGBA")
         least = HALF if image.format == "JPEG" else 1
         values = np.asarray(image)
-        if values.ndim == 3 and image.mode in ("LA", "RGBA"):
+        if image.mode in ("LA", "RGBA"):
             values = values[:, :, :-1] * (values[:, :, -1:] > 0)
         keep = (values.reshape(*values.shape[:2], -1) >= least).any(axis=2)
     return _reduced(np.asarray(keep), size)
