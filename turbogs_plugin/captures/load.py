@@ -98,12 +98,11 @@ def load_scene(
             places, how = starting_points(capture.viewmats[own], capture.Ks[own], capture.sizes[own])
             notes = (*capture.notes, f"{len(places):,} random points are drawn {how}, as the capture has none")
             capture = replace(capture, points=places, point_colors=np.zeros(places.shape, np.uint8), notes=notes)
-    if validation:
-        note = f"{test.sum()} test photos are left out: photos that choose settings are among the others"
-        capture = capture.subset(np.flatnonzero(~test), np.arange(len(capture.points)), (note,))
-        capture = replace(capture, test=None)
-        test = _test_views(scene, capture, test_every)
-    with np.errstate(over="ignore", invalid="ignore"):
+        if validation:
+            note = f"{test.sum()} test photos are left out: photos that choose settings are among the others"
+            capture = capture.subset(np.flatnonzero(~test), np.arange(len(capture.points)), (note,))
+            capture = replace(capture, test=None)
+            test = _test_views(scene, capture, test_every)
         frame = Frame.around(camera_centers(capture.viewmats[~test]), capture.points)
     points = torch.from_numpy(frame.normalise_points(capture.points)).float()  # [M, 3]
     if (far := ~(points.abs() < FARTHEST).all(dim=1)).any():
