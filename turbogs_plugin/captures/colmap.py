@@ -112,7 +112,7 @@ def _own_split(scene: Path, folder: Path, names: Sequence[str]) -> tuple[np.ndar
 def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict[int, Lens | None]) -> Observations:
     """Places where images, the views, show points that are there, in pixels of their pinhole cameras. `lenses`: by the
     cameras' identifiers, None for a pinhole."""
-    ids, parts = model.points["id"], []
+    ids, parts = model.points["id"].copy(), []  # not strided: else each search would copy them
     for view, image in enumerate(images):
         shown = image.features[image.features["point"] != colmap_files.NO_POINT]
         points = np.searchsorted(ids, shown["point"])
