@@ -36,6 +36,7 @@ def test_its_defaults_are_the_values_of_turbogs():
     for name, digits in (("opacity_decay", 2), ("prune_score_fraction", 3)):  # 145 events in the place of 33
         assert controller[name] == round(1 - (1 - section[name]) ** (33 / 145), digits)
     assert controller["final_keep"] == 1.0
+    assert TurboDensityStrategy()._controller(0, "error").prune_score_fraction == 0.0
 
 
 @dataclass

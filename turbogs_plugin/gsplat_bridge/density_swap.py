@@ -60,8 +60,8 @@ class TurboDensityStrategy(DefaultStrategy):
         grow_absgrad2d, grow_grad2d: thresholds of a view's mean absolute and signed gradient. By squares one of them
             counts, as absgrad says; by errors it suffices to pass either.
         grow_scale3d: percent_dense of `ErrorDrivenDensity`.
-        top_fraction: as of `ErrorDrivenDensity`, by errors alone.
-        prune_score_fraction, opacity_decay: as of `ErrorDrivenDensity`.
+        top_fraction, opacity_decay: as of `ErrorDrivenDensity`; the former by errors alone.
+        prune_score_fraction: as of `ErrorDrivenDensity`. None: 0.012 by squares, 0 by errors.
         max_gaussians: never more, at any step.
     """
 
@@ -71,7 +71,7 @@ class TurboDensityStrategy(DefaultStrategy):
     grow_absgrad2d: float = 6e-4
     top_fraction: float = 0.9
     max_gaussians: int = 0
-    prune_score_fraction: float = 0.012
+    prune_score_fraction: float | None = None
     opacity_decay: float = 0.11
 
     def __post_init__(self) -> None:
@@ -181,7 +181,8 @@ class TurboDensityStrategy(DefaultStrategy):
 
     def _controller(self, step: int, driven_by: str = "gradient") -> ErrorDrivenDensity:
         """The controller with the present values of all fields."""
-        same = ("refine_every", "top_fraction", "max_gaussians", "prune_score_fraction", "opacity_decay")
+        same = ("refine_every", "top_fraction", "max_gaussians", "opacity_decay")
+        by_errors, removed = driven_by == "error", self.prune_score_fraction
         return ErrorDrivenDensity(
             **{name: getattr(self, name) for name in same},
             refine_from=self.refine_start_iter + 1,
@@ -189,7 +190,8 @@ class TurboDensityStrategy(DefaultStrategy):
             absgrad_threshold=self.grow_absgrad2d if self.absgrad else self.grow_grad2d,
             percent_dense=self.grow_scale3d,
             split="long_axis",
-            choose_by="difficulty" if driven_by == "error" else "squares",
+            choose_by="difficulty" if by_errors else "squares",
+            prune_score_fraction=removed if removed is not None else 0.0 if by_errors else 0.012,
             final_keep=1.0,  # a host's run may end at any step
             prune_opacity=self.prune_opa,
             prune_world_size=self.prune_scale3d,
