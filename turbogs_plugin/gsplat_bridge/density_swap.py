@@ -26,8 +26,9 @@ from turbogs_plugin.gsplat_bridge.host import (
 )
 from turbogs_plugin.gsplat_bridge.optimizer_swap import COUNT
 from turbogs_plugin.model.row_order import in_order_of_space
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
-from turbogs_plugin.strategies.density.rows import add_stats
+from turbogs_plugin.strategies.density.rows import add_stats, finite_rows
 from turbogs_plugin.types import GaussianStats, RowUpdate, Step
 
 _STATS = tuple(GaussianStats.__dataclass_fields__)
@@ -80,6 +81,7 @@ class TurboDensityStrategy(DefaultStrategy):
         if pause:
             warnings.warn(f"pause_refine_after_reset={pause} has no effect: opacities are never reset", stacklevel=3)
         require(key == "means2d", "key_for_gradient", key, "'means2d': error sums are of 3D Gaussians")
+        require_settings(self)  # by the fields' own names
         self._controller(0)  # checks the rest
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
@@ -141,6 +143,9 @@ class TurboDensityStrategy(DefaultStrategy):
         controller.stats = window
         stop = self.refine_stop_iter
         now = Step(step, stop, stop - 1, scene_extent=state["scene_scale"])
+        if lost := int((~finite_rows(gaussians)).sum()):
+            gone = f"step {step}: {lost} of {len(gaussians)} Gaussians are not finite and go"
+            warnings.warn(f"{gone}; look for a loss or a gradient of nan or inf", stacklevel=2)
         update = controller.update(gaussians, now)  # zeroes the window
         if update is None:
             return
