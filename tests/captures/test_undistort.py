@@ -12,7 +12,7 @@ from helpers.refusals import assert_refused
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
-from turbogs_plugin.captures.undistort import lens_of_camera
+from turbogs_plugin.captures.undistort import pinhole_of_camera
 
 pytestmark = pytest.mark.usefixtures("few_random_points")
 
@@ -139,8 +139,8 @@ def test_transforms_photos_are_those_of_a_pinhole(tmp_path, content, model, para
 
 
 def test_a_wide_fisheye_keeps_to_60_degrees_off_the_axis():
-    lens = lens_of_camera(camera("OPENCV_FISHEYE", [100.0, 100.0, 160.0, 120.0, 0.0, 0.0, 0.0, 0.0]), "a camera")
-    extent = np.array(lens.size) / lens.K[[0, 1], [0, 1]] / 2
+    K, size, _ = pinhole_of_camera(camera("OPENCV_FISHEYE", [100.0, 100.0, 160.0, 120.0, 0.0, 0.0, 0.0, 0.0]), "camera")
+    extent = np.array(size) / K[[0, 1], [0, 1]] / 2
     assert (extent < np.tan(np.pi / 3) + 0.01).all() and extent.max() > 1.5  # of 173 degrees at the photo's rim
 
 
@@ -182,4 +182,4 @@ def test_a_zero_distortion_changes_no_pixel(tmp_path):
     ],
 )
 def test_what_is_no_lens_is_refused(model, params, words):
-    assert_refused(f"camera 1{words}", lens_of_camera, camera(model, params), "camera 1")
+    assert_refused(f"camera 1{words}", pinhole_of_camera, camera(model, params), "camera 1")

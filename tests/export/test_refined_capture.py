@@ -93,16 +93,20 @@ def test_features_tracks_and_colours_stay(given, refined):
     assert sum((point.xyz != old.xyz).any() for point, old in pairs) > 40
 
 
-def test_images_without_a_photo_are_left_out(copy):
+def test_images_without_a_photo_and_points_that_are_not_finite_are_left_out(copy):
     (copy / "images/03.png").unlink()
+    model = model_of(copy)
+    model.points3D[7].xyz = np.full(3, np.nan)
+    model.write_binary(copy / "sparse/0")
     new = copy.with_name("new")
     lines = write_refined(copy, new).splitlines()
-    assert lines[0].startswith("1 of 6 images are left out") and lines[1].startswith("5 of 5 cameras refined")
+    assert lines[0].startswith("1 of 6 images are left out") and lines[2].startswith("5 of 5 cameras refined")
+    assert lines[1].startswith("1 of 80 points are left out") and 7 not in model_of(new).points3D
     before, after = model_of(copy), model_of(new)
     gone = before.find_image_with_name("03.png").image_id
     assert after.is_valid() and set(after.images) == set(before.images) - {gone} == set(after.cameras)
     tracks = [point.track.elements for point in after.points3D.values()]
-    assert len(tracks) == 80 and all(len(track) == 5 and gone not in {at.image_id for at in track} for track in tracks)
+    assert len(tracks) == 79 and all(len(track) == 5 and gone not in {at.image_id for at in track} for track in tracks)
     assert len(load_scene(new).train) == 4
 
 
@@ -151,7 +155,7 @@ REFUSED = [
     (lambda capture: capture / "absent", "absent has no COLMAP reconstruction .* by  turbogs reconstruct", "new"),
     (without_points, "sparse/0 has no points that its photos show", "new"),
     (with_distortion, r"6 of 6 cameras have distortion \(OPENCV\)", "new"),
-    (with_other_features, r"half of its points are more than 12.8 pixels \(2% of .*: reconstruct the photos", "new"),
+    (with_other_features, "half of its points are over 2% of a photo.* show them: reconstruct the", "new"),
     (Path, "--out .*new' would lie among the photos of .*images': choose another folder", "cup/images/new"),
     (Path, r"--out .*new' cannot be made in .* \(not a folder\): choose a folder to write", "cup/images/00.png/new"),
 ]

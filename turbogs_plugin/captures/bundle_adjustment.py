@@ -128,15 +128,11 @@ def reprojection_errors(cameras: Pinholes, points: np.ndarray, observations: Obs
     return _Adjustment(cameras, points, observations).first_errors
 
 
-def farthest_match(cameras: Pinholes) -> float:
-    """`FARTHEST_MATCH` in pixels."""
-    return FARTHEST_MATCH * 2.0 * float(np.median(cameras.half_widths))
-
-
 def of_these_photos(cameras: Pinholes, points: np.ndarray, observations: Observations) -> bool:
     """True where observations belong to the photos of these cameras, not to others or to another size: half of the
-    points are within `farthest_match`."""
-    return _median(reprojection_errors(cameras, points, observations)) <= farthest_match(cameras)
+    points are within `FARTHEST_MATCH`."""
+    width = 2.0 * float(np.median(cameras.half_widths))
+    return _median(reprojection_errors(cameras, points, observations)) <= FARTHEST_MATCH * width
 
 
 class _Adjustment:
@@ -229,10 +225,10 @@ class _Adjustment:
         seen = np.bincount(self.point_ids, entries[0] + entries[3] + entries[5] > 0, count)
         sums = np.stack([np.bincount(self.point_ids, values, count) for values in entries])  # [9, M]
         traces = sums[0] + sums[3] + sums[5]
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # what is not finite weighs nothing
-            sums = sums / traces
-            sums[[0, 3, 5]] += POINT_DAMPING
-            self.places += np.where((seen >= 2) & (traces > 0), _solved(*sums), 0.0)
+        told = (seen >= 2) & (traces > 0)
+        sums = sums[:, told] / traces[told]
+        normals = sums[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3) + POINT_DAMPING * np.eye(3)
+        self.places[:, told] += np.linalg.solve(normals, sums[6:].T[:, :, None])[:, :, 0].T
 
     def agreeing_cameras(self) -> Pinholes:
         """The cameras; the given one where its photo agrees no better."""
@@ -240,13 +236,6 @@ class _Adjustment:
         better = np.array([_median(new[own]) < _median(old[own]) for own in self.own])
         pairs = zip(self.cameras, self.given, strict=True)
         return Pinholes(*(np.where(better.reshape(-1, *[1] * (now.ndim - 1)), now, then) for now, then in pairs))
-
-
-def _solved(a, b, c, d, e, f, x, y, z) -> np.ndarray:
-    """[3, M]: the solutions of M systems ((a, b, c), (b, d, e), (c, e, f)) s = (x, y, z), by Cramer's rule."""
-    aa, ab, ac, bb, bc, cc = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
-    determinant = a * aa + b * ab + c * ac
-    return np.stack([aa * x + ab * y + ac * z, ab * x + bb * y + bc * z, ac * x + bc * y + cc * z]) / determinant
 
 
 class RefinedCameras(NamedTuple):

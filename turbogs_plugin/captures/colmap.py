@@ -14,7 +14,7 @@ from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, named, text_
 from turbogs_plugin.captures.colmap_files import CLOUD, FILES, ColmapModel, ModelImage, read_model
 from turbogs_plugin.captures.photo_files import IMAGES, find_named
 from turbogs_plugin.captures.starting_points import clouds_beside
-from turbogs_plugin.captures.undistort import Lens, lens_of_camera, load_pycolmap
+from turbogs_plugin.captures.undistort import Lens, pinhole_of_camera
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.types.cameras import Observations
 
@@ -58,10 +58,8 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
     if not (images := [model.images[place] for place in found.places]):
         raise InputError(f"{folder} has no images with a pose: reconstruct the capture again")
     ids = {image.camera for image in images}
-    lenses = {id: lens_of_camera(model.cameras[id], f"camera {id} of {folder}") for id in ids}
-    pairs = [(model.cameras[image.camera], lenses[image.camera]) for image in images]
-    Ks = [camera.calibration_matrix() if lens is None else lens.K for camera, lens in pairs]
-    sizes = [(camera.width, camera.height) if lens is None else lens.size for camera, lens in pairs]
+    pinholes = {id: pinhole_of_camera(model.cameras[id], f"camera {id} of {folder}") for id in ids}
+    Ks, sizes, lenses = zip(*(pinholes[image.camera] for image in images), strict=True)
     where = "" if found.folder == scene / IMAGES else f", photos in {found.folder}"
     mixed = any(not (folder / f"{file}{suffix}").is_file() for file in FILES[:2])
     kind = "binary and text" if mixed else "binary" if suffix == ".bin" else "text"
@@ -79,7 +77,7 @@ def read_colmap(scene: Path, folder: Path, suffix: str) -> Capture:
         sizes=np.array(sizes),
         points=model.points["xyz"].copy(),
         point_colors=model.points["color"].copy(),
-        lenses=tuple(lens for _, lens in pairs),
+        lenses=lenses,
         mask_files=(None,) * len(images),
         notes=(
             f"COLMAP reconstruction {folder} ({kind}): {len(images)} images, {len(model.points):,} points"
@@ -109,32 +107,19 @@ def _own_split(scene: Path, folder: Path, names: Sequence[str]) -> tuple[np.ndar
     return None, f", {file} not used: {test.sum()} of its names have a photo"
 
 
-def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: dict[int, Lens | None]) -> Observations:
-    """Places where images, the views, show points that are there, in pixels of their pinhole cameras. `lenses`: by the
-    cameras' identifiers, None for a pinhole."""
+def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: Sequence[Lens | None]) -> Observations:
+    """Places where images, the views, show points that are there, in pixels of their pinhole cameras. `lenses`: one an
+    image, None for a pinhole."""
     ids, parts = model.points["id"].copy(), []  # not strided: else each search would copy them
-    for view, image in enumerate(images):
+    for view, (image, lens) in enumerate(zip(images, lenses, strict=True)):
         shown = image.features[image.features["point"] != colmap_files.NO_POINT]
         points = np.searchsorted(ids, shown["point"])
-        pixels, lens = shown["pixel"].astype(np.float64), lenses[image.camera]
+        pixels = shown["pixel"].astype(np.float64)
         if lens is not None and len(pixels):
             pixels = model.cameras[image.camera].cam_from_img(pixels) * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2]
         known = np.isfinite(pixels).all(axis=1) & (ids[points.clip(max=len(ids) - 1)] == shown["point"])
         parts.append((pixels[known], np.full(known.sum(), view), points[known]))
     return Observations(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-
-def read_reconstruction(folder: Path, suffix: str) -> pycolmap.Reconstruction:
-    """What `read_colmap` has read, as pycolmap reads it, with whole names. Raises `InputError` where it cannot."""
-    reconstruction = load_pycolmap().Reconstruction()
-    try:
-        (reconstruction.read_binary if suffix == ".bin" else reconstruction.read_text)(folder)
-    except Exception as error:  # pycolmap raises whatever C++ threw
-        raise InputError(f"{folder}: pycolmap cannot read this reconstruction; copy or reconstruct it again") from error
-    for image in read_model(folder, suffix).images:  # pycolmap cuts a name in text at its first space
-        if image.number in reconstruction.images:
-            reconstruction.images[image.number].name = image.name.replace("\\", "/")
-    return reconstruction
 
 
 def write_whole(reconstruction: pycolmap.Reconstruction, folder: Path, called: Path) -> None:

@@ -74,13 +74,12 @@ def is_transparent(image: Image.Image) -> bool:
 
 def channels_of(paths: Sequence[Path]) -> int:
     """4 where a photo may be transparent, by the headers, else 3."""
-
-    def transparent(path: Path) -> bool:
-        with opened_image(path) as image:
-            return is_transparent(image)
-
-    with decoding_threads() as pool:
-        return 4 if any(pool.map(transparent, (p for p in paths if p.suffix.lower() not in OPAQUE_SUFFIXES))) else 3
+    for path in paths:
+        if path.suffix.lower() not in OPAQUE_SUFFIXES:
+            with opened_image(path) as image:
+                if is_transparent(image):
+                    return 4
+    return 3
 
 
 def photo_sizes(paths: Sequence[Path]) -> np.ndarray:

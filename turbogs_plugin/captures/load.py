@@ -175,10 +175,9 @@ def _test_views(scene: Path, capture: Capture, test_every: int) -> np.ndarray:
     """[V] bool: the test views, by the capture's own split or by order; enough views remain to train on."""
     views = len(capture.names)
     test = np.arange(views) % test_every == 0 if capture.test is None else capture.test
-    if views < FEWEST_PHOTOS:
-        raise InputError(f"{scene} has {views} images: at least {FEWEST_PHOTOS} are needed; add photos to it")
-    if capture.test is not None and (~test).sum() < FEWEST_PHOTOS:
-        raise InputError(f"{scene} has {(~test).sum()} training images: at least {FEWEST_PHOTOS} are needed; add some")
+    count, kind = (views, "images") if capture.test is None else ((~test).sum(), "training images")
+    if count < FEWEST_PHOTOS:
+        raise InputError(f"{scene} has {count} {kind}: at least {FEWEST_PHOTOS} are needed; add photos to it")
     if test.all():
         raise InputError(f"test_every is {test_every}: every image of {scene} would be a test image; use 2 or more")
     return test

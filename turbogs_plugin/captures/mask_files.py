@@ -103,7 +103,7 @@ def load_masks(
         if keep.all():
             return None
         if lens is not None:
-            keep = np.asarray(lens.undistort(_image(keep))) == 255
+            keep = np.asarray(lens.undistort(Image.fromarray(keep).convert("L"))) == 255
         return PixelMasks.of(_reduced(keep, target))
 
     with decoding_threads() as pool:
@@ -132,12 +132,6 @@ def require_mask_size(file: Path, mask_size: Size, photo: Path, size: Size, othe
         raise InputError(f"mask {file} is {mask} but photo {photo} is {wanted}: {remedy}")
 
 
-def _image(keep: np.ndarray) -> Image.Image:
-    """An image that is white where [H, W] bool is True, and black elsewhere."""
-    return Image.fromarray(np.where(keep, np.uint8(255), np.uint8(0)))
-
-
 def _reduced(keep: np.ndarray, size: Size) -> np.ndarray:
     """[H, W] bool of `size` (width, height): True where all that a pixel is made of is True."""
-    image = _image(keep)
-    return np.asarray(image if image.size == size else image.resize(size, Image.Resampling.BOX)) == 255
+    return np.asarray(Image.fromarray(keep).convert("L").resize(size, Image.Resampling.BOX)) == 255

@@ -7,6 +7,8 @@ NeRF-synthetic tells training and test photos apart by file; its photos are name
 from __future__ import annotations
 
 import math
+from collections import ChainMap
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -17,7 +19,7 @@ from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture, text_of
 from turbogs_plugin.captures.decoding import photo_size
 from turbogs_plugin.captures.photo_files import file_named, find_named
 from turbogs_plugin.captures.starting_points import clouds_beside, read_cloud
-from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens, lens_of_camera, load_pycolmap
+from turbogs_plugin.captures.undistort import LARGEST_SIDE, Lens, load_pycolmap, pinhole_of_camera
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.agreement import OTHER_AXES
 from turbogs_plugin.scene.geometry import viewmat_of_pose
@@ -33,11 +35,7 @@ BROWN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RA
 """Names of one model, whose missing coefficients are 0."""
 FISHEYE = "OPENCV_FISHEYE"
 BENDS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of distortion, as COLMAP's FULL_OPENCV has them
-FOR_ALL = {*("camera_model", "is_fisheye", "w", "h", *BENDS, "mask_path"),
-           *("fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")}  # fmt: skip
-"""Keys of a file that hold for each frame without a value of its own."""
-
-Frame = dict[str, Any]  # a frame of a file, with what stands there for all frames
+Frame = ChainMap[str, Any]  # a frame of a file; what stands there for all frames counts where the frame lacks it
 
 
 def read_transforms(scene: Path) -> Capture:
@@ -81,9 +79,8 @@ def _frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[Fra
     content, frames = read_frames(source, key)
     if not all(isinstance(frame.get("file_path"), str) for frame in frames):
         raise InputError(f"{source} has a frame without a file_path: export it again")
-    shared = {key: value for key, value in content.items() if key in FOR_ALL}
-    whole: list[Frame] = [shared | frame for frame in frames]
-    return content, list({repr(frame): frame for frame in whole}.values())  # of equal ones the first
+    distinct = {repr(frame): frame for frame in frames}.values()  # of equal ones the first
+    return content, [ChainMap(frame, content) for frame in distinct]
 
 
 def _written(frame: Frame) -> str:
@@ -96,7 +93,8 @@ def _capture(source: Path, content: dict[str, Any], frames: list[Frame], test: s
     `content` is the file's, whose ``ply_file_path`` has the points; `test` has written names of the test photos: where
     none of them exists, there is no own split; `words` are on the kind of capture."""
     names, cloud, scene = [_written(frame) for frame in frames], content.get("ply_file_path"), source.parent
-    others = {text for frame in frames for key, text in frame.items() if key != "file_path" and isinstance(text, str)}
+    said = (content, *(frame.maps[0] for frame in frames))
+    others = {text for values in said for key, text in values.items() if key != "file_path" and isinstance(text, str)}
     found = find_named(scene, [frame["file_path"] for frame in frames], source, ("", "images"), others)
     rows, damaged = [], []
     for name, place in zip(found.names, found.places, strict=True):
@@ -167,7 +165,7 @@ def _file(name: Any, what: str, source: Path) -> Path:
     raise InputError(f"{source}: its {what}, {str(name)[:200]!r}, is not there: bring it back, or take it out")
 
 
-def number_of(values: dict, source: Path, key: str, default: float | None = None) -> float | None:
+def number_of(values: Mapping[str, Any], source: Path, key: str, default: float | None = None) -> float | None:
     """A finite number, also one that is written as text, or the default where the key is absent."""
     if key not in values:
         return default
@@ -206,11 +204,10 @@ def _read_camera(values: Frame, photo: Path, source: Path) -> tuple[np.ndarray, 
     kind = model if model == FISHEYE else "FULL_OPENCV" if bends["k3"] else "OPENCV"
     keys = {FISHEYE: known, "FULL_OPENCV": BENDS, "OPENCV": BENDS[:4]}[kind]
     params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *(bends[key] for key in keys)]
-    lens = lens_of_camera(load_pycolmap().Camera(model=kind, width=size[0], height=size[1], params=params), owner)
-    return (K, size, None) if lens is None else (lens.K, lens.size, lens)
+    return pinhole_of_camera(load_pycolmap().Camera(model=kind, width=size[0], height=size[1], params=params), owner)
 
 
-def pinhole(values: dict, source: Path, size: tuple[float, float]) -> np.ndarray | None:
+def pinhole(values: Mapping[str, Any], source: Path, size: tuple[float, float]) -> np.ndarray | None:
     """[3, 3] float64 intrinsics of one frame; None where nothing gives its horizontal focal length. The principal point
     is in the middle of the `size` (width, height) unless it is given."""
     focals: list[float | None] = []

@@ -71,14 +71,15 @@ class Lens:
         return Image.frombytes(photo.mode, self.size, np.concatenate(made, axis=2).tobytes())
 
 
-def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
-    """The lens of a camera of any of COLMAP's models; None for a pinhole, and for an impossible size, which
-    `Capture.checked` refuses. Raises `InputError` for a panorama, which no pinhole camera can show, and for parameters
-    that are not those of a lens within the photo, or of another size; `owner` names the camera."""
+def pinhole_of_camera(camera: pycolmap.Camera, owner: str) -> tuple[np.ndarray, tuple[int, int], Lens | None]:
+    """The pinhole that takes the place of a camera of any of COLMAP's models: [3, 3] float64 intrinsics, (width,
+    height), and the lens; None for a camera that is a pinhole, or has an impossible size, which `Capture.checked`
+    refuses. Raises `InputError` for a panorama, which no pinhole camera can show, and for parameters that are not those
+    of a lens within the photo, or of another size; `owner` names the camera."""
     model, size = camera.model.name, (camera.width, camera.height)
     bent = model not in STRAIGHT_MODELS or camera.params[list(camera.extra_params_idxs())].any()
     if not bent or max(size) > LARGEST_SIDE:
-        return None
+        return camera.calibration_matrix(), size, None
     if not camera.is_perspective():
         raise InputError(f"{owner} is {model}, a panorama: {PANORAMA_REMEDY}")
     if (lens := _lens(model, size, tuple(camera.params.tolist()))) is None:
@@ -86,7 +87,7 @@ def lens_of_camera(camera: pycolmap.Camera, owner: str) -> Lens | None:
         trouble += ": reconstruct the capture again, with the model OPENCV_FISHEYE for a wide lens"
         other_size = off_middle(camera.params[list(camera.principal_point_idxs())] / size)
         raise InputError(f"{owner}: {other_size}" if other_size else f"{owner} is {model} {trouble}")
-    return lens
+    return lens.K, lens.size, lens
 
 
 @lru_cache(maxsize=64)

@@ -19,12 +19,12 @@ from turbogs_plugin.captures.bundle_adjustment import (
     FARTHEST_MATCH,
     Pinholes,
     Refinement,
-    farthest_match,
     of_these_photos,
     refine_together,
 )
 from turbogs_plugin.captures.capture import Capture
-from turbogs_plugin.captures.colmap import find_model, read_colmap, read_reconstruction, write_whole
+from turbogs_plugin.captures.colmap import find_model, read_colmap, write_whole
+from turbogs_plugin.captures.colmap_files import ColmapModel, read_model
 from turbogs_plugin.captures.mask_files import FOLDER as MASKS
 from turbogs_plugin.captures.undistort import load_pycolmap
 from turbogs_plugin.errors import InputError
@@ -69,8 +69,7 @@ def write_refined(scene: Path, out: Path) -> str:
         raise InputError(f"--out '{out}' would lie among the photos of '{capture.photo_folder}': choose another folder")
     given = Pinholes.of(capture.viewmats, capture.Ks, capture.sizes)
     if not of_these_photos(given, capture.points, observations):
-        far = f"more than {farthest_match(given):.1f} pixels ({FARTHEST_MATCH:.0%} of a photo's width)"
-        trouble = f"half of its points are {far} from where its photos show them"
+        trouble = f"half of its points are over {FARTHEST_MATCH:.0%} of a photo's width from where photos show them"
         raise InputError(f"{found[0]}: {trouble}: reconstruct the photos again")
     refined = refine_together(given, capture.points, observations)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -81,7 +80,7 @@ def write_refined(scene: Path, out: Path) -> str:
         try:
             for name, source in ({"images": capture.photo_folder} | linked).items():
                 (folder / name).symlink_to(source.resolve(), target_is_directory=True)
-            write_whole(_reconstruction(*found, capture, refined), folder / "sparse/0", out)
+            write_whole(_reconstruction(read_model(*found), capture, refined), folder / "sparse/0", out)
         except OSError as error:
             remedy = "make room there, or choose a disk that takes links"
             raise InputError(f"--out '{out}' cannot be written: {remedy}") from error
@@ -89,24 +88,23 @@ def write_refined(scene: Path, out: Path) -> str:
     return "\n".join([*capture.notes[1:], refined.text("cameras"), f"scene  {out}"])
 
 
-def _reconstruction(model: Path, suffix: str, capture: Capture, refined: Refinement) -> pycolmap.Reconstruction:
-    """The reconstruction in `model`, from which a capture was read, with refined cameras, and points in the order of
-    their identifiers."""
-    pycolmap = load_pycolmap()
-    old, new = read_reconstruction(model, suffix), pycolmap.Reconstruction()
-    images = {image.name: image for image in old.images.values() if image.has_pose}
-    cameras, kept = refined.cameras, {images[name].image_id for name in capture.names}  # with a photo and a pose
+def _reconstruction(model: ColmapModel, capture: Capture, refined: Refinement) -> pycolmap.Reconstruction:
+    """The reconstruction of which a capture is, with refined cameras, and points in the order of their identifiers."""
+    pycolmap, cameras = load_pycolmap(), refined.cameras
+    reconstruction, finite = pycolmap.Reconstruction(), np.isfinite(model.points["xyz"]).all(axis=1)
+    numbers, colors = model.points["id"][finite], model.points["color"][finite]
+    for number, place, color in zip(numbers.tolist(), refined.points, colors, strict=True):
+        reconstruction.add_point3D_with_id(number, pycolmap.Point3D(xyz=place, color=color))
+    images = {image.name.replace("\\", "/"): image for image in model.images}
     for view, (name, (width, height)) in enumerate(zip(capture.names, capture.sizes.tolist(), strict=True)):
-        number = images[name].image_id  # of the camera, too
+        number, features = images[name].number, images[name].features  # the number is the camera's, too
         params = [*cameras.focal[view], *cameras.centers[view]]
         camera = pycolmap.Camera(camera_id=number, model="PINHOLE", width=width, height=height, params=params)
-        new.add_camera_with_trivial_rig(camera)
+        reconstruction.add_camera_with_trivial_rig(camera)
         pose = pycolmap.Rigid3d(np.c_[cameras.rotations[view], cameras.translations[view]])
-        image = pycolmap.Image(name, points2D=images[name].points2D, camera_id=number, image_id=number)
-        new.add_image_with_trivial_frame(image, pose)
-    for (number, point), place in zip(sorted(old.points3D.items()), refined.points, strict=True):
-        point.xyz = place
-        point.track.elements = [element for element in point.track.elements if element.image_id in kept]
-        new.add_point3D_with_id(number, point)
-    new.update_point_3d_errors()
-    return new
+        image = pycolmap.Image(name, keypoints=features["pixel"], camera_id=number, image_id=number)
+        reconstruction.add_image_with_trivial_frame(image, pose)
+        for place in np.flatnonzero(np.isin(features["point"], numbers)).tolist():
+            reconstruction.add_observation(features["point"][place], pycolmap.TrackElement(number, place))
+    reconstruction.update_point_3d_errors()
+    return reconstruction
