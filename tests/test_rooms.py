@@ -58,10 +58,10 @@ Whoever needs more takes something out, or says in the change which measured gai
 
 STILL_LARGER = {
     "turbogs_plugin/captures": (
-        2_602,
+        2_566,
         "bundle adjustment (.18 to .5 dB); files as other programs and scripts leave them; depth maps, .exr too; scans",
     ),
-    "turbogs_plugin/export": (785, "glTF, OpenUSD and .spz 2; a local origin for UTM captures; size and rate of films"),
+    "turbogs_plugin/export": (783, "glTF, OpenUSD and .spz 2; a local origin for UTM captures; size and rate of films"),
 }
 """Folder or modules above their budget -> lines that they have, and what pays for those beyond it. They only shrink;
 within the budget, an entry goes."""

@@ -1,6 +1,6 @@
 """Error-driven density control in gsplat's trainer: ``python density.py SIMPLE_TRAINER.py``.
 
-Gaussians are ranked by screen gradients; `errors.py` adds the line that ranks them by error.
+Gaussians grow and go by squares of screen gradients; `errors.py` adds the line that ranks them by error.
 """
 
 from editing import command_line

@@ -36,6 +36,7 @@ def test_its_defaults_are_the_values_of_turbogs():
     for name, digits in (("opacity_decay", 2), ("prune_score_fraction", 3)):  # 145 events in the place of 33
         assert controller[name] == round(1 - (1 - section[name]) ** (33 / 145), digits)
     assert controller["final_keep"] == 1.0
+    assert TurboDensityStrategy()._controller(0, "error").prune_score_fraction == 0.0
 
 
 @dataclass
@@ -181,6 +182,14 @@ def test_a_host_in_double_precision_trains(tells_errors):
     host.assert_rows_match()
 
 
+def test_gaussians_that_are_not_finite_go_with_a_warning():
+    host = Host(TurboDensityStrategy(**SOON))
+    host.splats["means"].data[:7] = float("nan")
+    with pytest.warns(UserWarning, match="step 3: 7 of 40 Gaussians are not finite and go; look for a loss"):
+        host.train(4)
+    assert len(host.splats["means"]) > 7 and all(value.isfinite().all() for value in host.splats.values())
+
+
 def test_a_row_update_moves_parameters_state_and_statistics_alike():
     host = Host(TurboDensityStrategy(refine_start_iter=1000))
     host.train(2)
@@ -240,7 +249,7 @@ def test_what_does_not_fit_is_refused_by_name():
     assert_refused(r"means2d'\] has no gradient", post, *common, state, 1, host.info)
     host.tells_errors, host.state["grad_sums"] = False, host.state["grad_sums"][:7]
     assert_refused(r"state\['grad_sums'\] has 7 rows, the parameters 40", host.step, 1)
-    for name, value in {"revised_opacity": True, "key_for_gradient": "x", "top_fraction": 0.0}.items():
+    for name, value in (("revised_opacity", True), ("key_for_gradient", "x"), ("grow_absgrad2d", -1.0)):
         assert_refused(name, TurboDensityStrategy, **{name: value})
     assert Host(TurboDensityStrategy(**SOON, absgrad=False)).train(4)
     with pytest.warns(UserWarning, match="pause_refine_after_reset=5 has no effect"):

@@ -110,7 +110,7 @@ def _own_split(scene: Path, folder: Path, names: Sequence[str]) -> tuple[np.ndar
 def _observations(model: ColmapModel, images: Sequence[ModelImage], lenses: Sequence[Lens | None]) -> Observations:
     """Places where images, the views, show points that are there, in pixels of their pinhole cameras. `lenses`: one an
     image, None for a pinhole."""
-    ids, parts = model.points["id"], []
+    ids, parts = model.points["id"].copy(), []  # not strided: else each search would copy them
     for view, (image, lens) in enumerate(zip(images, lenses, strict=True)):
         shown = image.features[image.features["point"] != colmap_files.NO_POINT]
         points = np.searchsorted(ids, shown["point"])

@@ -15,6 +15,7 @@ from turbogs_plugin.scene.geometry import camera_centers, evenly, mean_neighbor_
 from turbogs_plugin.scene.photos import Photos, pixel_offsets
 from turbogs_plugin.scene.ply import read_colors, read_vertices
 from turbogs_plugin.types import Cameras
+from turbogs_plugin.types.gaussians import SH_C0
 
 NUM_RANDOM_POINTS = 50_000
 GREY = 128  # colour of points without one
@@ -26,10 +27,15 @@ COLOR_VIEWS = 32  # photos that give random points their colours, at most
 
 
 def read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
-    """[M, 3] float64 and [M, 3] uint8 of a cloud in a .ply, and words on it where it has no colours and is grey."""
+    """[M, 3] float64 and [M, 3] uint8 of a cloud in a .ply, and words on it where it has no colours and is grey. A 3DGS
+    model's colours are its harmonics of degree 0."""
     vertices = {name.lower().removeprefix("diffuse_"): column for name, column in read_vertices(path).items()}
     points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    vertices = {name: vertices[name[0]] for name in ("red", "green", "blue") if name[0] in vertices} | vertices
+    for channel, share in (("red", "f_dc_0"), ("green", "f_dc_1"), ("blue", "f_dc_2")):
+        if channel[0] in vertices:
+            vertices.setdefault(channel, vertices[channel[0]])
+        elif share in vertices:
+            vertices.setdefault(channel, (0.5 + SH_C0 * vertices[share].astype(np.float64)).clip(0.0, 1.0))
     if (colors := read_colors(path, vertices)) is None:
         return points, np.full(points.shape, GREY, np.uint8), ", grey as it has no colours"
     return points, colors, ""

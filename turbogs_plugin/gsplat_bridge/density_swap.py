@@ -26,8 +26,9 @@ from turbogs_plugin.gsplat_bridge.host import (
 )
 from turbogs_plugin.gsplat_bridge.optimizer_swap import COUNT
 from turbogs_plugin.model.row_order import in_order_of_space
+from turbogs_plugin.strategies.checks import require_settings
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
-from turbogs_plugin.strategies.density.rows import add_stats
+from turbogs_plugin.strategies.density.rows import add_stats, finite_rows
 from turbogs_plugin.types import GaussianStats, RowUpdate, Step
 
 _STATS = tuple(GaussianStats.__dataclass_fields__)
@@ -60,8 +61,8 @@ class TurboDensityStrategy(DefaultStrategy):
         grow_absgrad2d, grow_grad2d: thresholds of a view's mean absolute and signed gradient. By squares one of them
             counts, as absgrad says; by errors it suffices to pass either.
         grow_scale3d: percent_dense of `ErrorDrivenDensity`.
-        top_fraction: as of `ErrorDrivenDensity`, by errors alone.
-        prune_score_fraction, opacity_decay: as of `ErrorDrivenDensity`.
+        top_fraction, opacity_decay: as of `ErrorDrivenDensity`; the former by errors alone.
+        prune_score_fraction: as of `ErrorDrivenDensity`. None: 0.012 by squares, 0 by errors.
         max_gaussians: never more, at any step.
     """
 
@@ -71,7 +72,7 @@ class TurboDensityStrategy(DefaultStrategy):
     grow_absgrad2d: float = 6e-4
     top_fraction: float = 0.9
     max_gaussians: int = 0
-    prune_score_fraction: float = 0.012
+    prune_score_fraction: float | None = None
     opacity_decay: float = 0.11
 
     def __post_init__(self) -> None:
@@ -80,6 +81,7 @@ class TurboDensityStrategy(DefaultStrategy):
         if pause:
             warnings.warn(f"pause_refine_after_reset={pause} has no effect: opacities are never reset", stacklevel=3)
         require(key == "means2d", "key_for_gradient", key, "'means2d': error sums are of 3D Gaussians")
+        require_settings(self)  # by the fields' own names
         self._controller(0)  # checks the rest
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
@@ -141,6 +143,9 @@ class TurboDensityStrategy(DefaultStrategy):
         controller.stats = window
         stop = self.refine_stop_iter
         now = Step(step, stop, stop - 1, scene_extent=state["scene_scale"])
+        if lost := int((~finite_rows(gaussians)).sum()):
+            gone = f"step {step}: {lost} of {len(gaussians)} Gaussians are not finite and go"
+            warnings.warn(f"{gone}; look for a loss or a gradient of nan or inf", stacklevel=2)
         update = controller.update(gaussians, now)  # zeroes the window
         if update is None:
             return
@@ -181,7 +186,8 @@ class TurboDensityStrategy(DefaultStrategy):
 
     def _controller(self, step: int, driven_by: str = "gradient") -> ErrorDrivenDensity:
         """The controller with the present values of all fields."""
-        same = ("refine_every", "top_fraction", "max_gaussians", "prune_score_fraction", "opacity_decay")
+        same = ("refine_every", "top_fraction", "max_gaussians", "opacity_decay")
+        by_errors, removed = driven_by == "error", self.prune_score_fraction
         return ErrorDrivenDensity(
             **{name: getattr(self, name) for name in same},
             refine_from=self.refine_start_iter + 1,
@@ -189,7 +195,8 @@ class TurboDensityStrategy(DefaultStrategy):
             absgrad_threshold=self.grow_absgrad2d if self.absgrad else self.grow_grad2d,
             percent_dense=self.grow_scale3d,
             split="long_axis",
-            choose_by="difficulty" if driven_by == "error" else "squares",
+            choose_by="difficulty" if by_errors else "squares",
+            prune_score_fraction=removed if removed is not None else 0.0 if by_errors else 0.012,
             final_keep=1.0,  # a host's run may end at any step
             prune_opacity=self.prune_opa,
             prune_world_size=self.prune_scale3d,
