@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from turbogs_plugin.gsplat_bridge.host import (
 )
 from turbogs_plugin.gsplat_bridge.optimizer_swap import COUNT
 from turbogs_plugin.model.row_order import in_order_of_space
-from turbogs_plugin.strategies.checks import require_settings
+from turbogs_plugin.strategies.checks import require_each
 from turbogs_plugin.strategies.density.error_driven import ErrorDrivenDensity
 from turbogs_plugin.strategies.density.rows import add_stats, finite_rows
 from turbogs_plugin.types import GaussianStats, RowUpdate, Step
@@ -45,8 +46,9 @@ _ANNOUNCEMENTS = {
 class TurboDensityStrategy(DefaultStrategy):
     """`ErrorDrivenDensity` behind the protocol of gsplat's strategies.
 
-    A subclass of `DefaultStrategy`, since trainers branch on that. Its fields keep their meaning, and may change at any
-    time. Opacities are never reset; reset_every only says when pruning by size begins. grow_scale2d has no effect.
+    A subclass of `DefaultStrategy`, since trainers branch on that. Its fields keep their meaning but for those below,
+    and may change at any time. Opacities are never reset; reset_every only says when pruning by size begins.
+    grow_scale2d has no effect.
 
     Gaussians grow and go by `squares`, here the sums of a view's squared absolute screen gradients. As many grow as
     pass the threshold; which ones is drawn in proportion to squares. Once a line ``info.update(prediction=colors,
@@ -81,7 +83,8 @@ class TurboDensityStrategy(DefaultStrategy):
         if pause:
             warnings.warn(f"pause_refine_after_reset={pause} has no effect: opacities are never reset", stacklevel=3)
         require(key == "means2d", "key_for_gradient", key, "'means2d': error sums are of 3D Gaussians")
-        require_settings(self)  # by the fields' own names
+        thresholds = ("grow_grad2d", "grow_absgrad2d", "grow_scale3d", "prune_opa", "prune_scale2d", "prune_scale3d")
+        require_each(self, lambda value: 0 <= value < math.inf, "a finite number >= 0", *thresholds)
         self._controller(0)  # checks the rest
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
@@ -144,8 +147,11 @@ class TurboDensityStrategy(DefaultStrategy):
         stop = self.refine_stop_iter
         now = Step(step, stop, stop - 1, scene_extent=state["scene_scale"])
         if lost := int((~finite_rows(gaussians)).sum()):
-            gone = f"step {step}: {lost} of {len(gaussians)} Gaussians are not finite and go"
-            warnings.warn(f"{gone}; look for a loss or a gradient of nan or inf", stacklevel=2)
+            gone = f"step {step}: {lost} of {len(gaussians)} Gaussians are not finite"
+            remedy = "look for a loss or a gradient of nan or inf"
+            if lost == len(gaussians):
+                raise InputError(f"{gone}: {remedy}")
+            warnings.warn(f"{gone} and go; {remedy}", stacklevel=2)
         update = controller.update(gaussians, now)  # zeroes the window
         if update is None:
             return
@@ -161,10 +167,15 @@ class TurboDensityStrategy(DefaultStrategy):
         """Add this iteration's statistics to those in `state`; returns the latter."""
         remedy = "pass the dict of TurboDensityStrategy.initialize_state()"
         require_keys(state, ("scene_scale", "driven_by", *_STATS), "the state", remedy)
-        stats, has_errors = iteration_stats(info, count)
+        stats, has_errors = iteration_stats(info, count, self.absgrad)
         driven_by = "error" if has_errors else "gradient"
         if state["driven_by"] is None:
             print(f"TurboDensityStrategy: {_ANNOUNCEMENTS[driven_by]}.")
+            if self.absgrad and not has_errors and self.grow_grad2d != TurboDensityStrategy.grow_grad2d:
+                ignored = f"grow_grad2d={self.grow_grad2d:g} has no effect"
+                warnings.warn(
+                    f"{ignored}: set grow_absgrad2d, or go by signed gradients by absgrad=False", stacklevel=3
+                )
             state.update(vars(GaussianStats.zeros(count, stats.view_counts.device)), driven_by=driven_by)
         if state["driven_by"] != driven_by:
             remedy = f"put '{PREDICTION}' and '{GROUND_TRUTH}' into info at every step, or at none"

@@ -49,10 +49,11 @@ def residuals(info: dict[str, Any]) -> Tensor | None:
     return errors[None] if errors.dim() == 2 else errors  # of one image [H, W, 3]
 
 
-def iteration_stats(info: dict[str, Any], count: int) -> tuple[GaussianStats, bool]:
+def iteration_stats(info: dict[str, Any], count: int, absgrad: bool = True) -> tuple[GaussianStats, bool]:
     """The statistics of the pass of N = `count` Gaussians that `info` tells of, packed or not, after its backward; and
-    whether they have error sums. Raises `InputError` where `info` lacks a key or a gradient, or is of another N."""
-    stats = screen_statistics(info, count)
+    whether they have error sums. Without `absgrad`, absolute gradients are not looked at. Raises `InputError` where
+    `info` lacks a key or a gradient, or is of another N."""
+    stats = screen_statistics(info, count, absgrad)
     if info.get(STATISTICS) is not None:  # with the screen gradients as the host left them: unscaled, say
         return replace(info[STATISTICS], grad_sums=stats.grad_sums, absgrad_sums=stats.absgrad_sums), True
     sums = _error_sums(info, count)
@@ -84,9 +85,9 @@ def rows_of(info: dict[str, Any]) -> int | None:
     return None if info.get("gaussian_ids") is not None else info["means2d"].shape[-2]
 
 
-def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
+def screen_statistics(info: dict[str, Any], count: int, absgrad: bool = True) -> GaussianStats:
     """Sums of screen gradients and their squares, of views, and largest radii, in gsplat's units; the sums over pixels
-    stay zero. Squares are of absolute gradients, where the pass has them."""
+    stay zero. Squares are of absolute gradients, where the pass has them and `absgrad` asks for them."""
     require_keys(info, ("means2d", "radii", "width", "height", "n_cameras", "gaussian_ids"), "info", RENDERED)
     means2d, radii, ids = info["means2d"], info["radii"], info["gaussian_ids"]
     if radii.dim() < means2d.dim():  # before gsplat 1.5 both axes have one radius
@@ -97,7 +98,7 @@ def screen_statistics(info: dict[str, Any], count: int) -> GaussianStats:
     half = means2d.new_tensor([0.5 * width * cameras, 0.5 * height * cameras])
     # Statistics are in single precision, whatever the host's.
     norms = [(means2d.grad * half).norm(dim=-1).float()]
-    absolute = getattr(means2d, "absgrad", None)
+    absolute = getattr(means2d, "absgrad", None) if absgrad else None
     norms.append(torch.zeros_like(norms[0]) if absolute is None else (absolute * half).norm(dim=-1).float())
     if ids is None:
         visible = (radii > 0).all(dim=-1)
