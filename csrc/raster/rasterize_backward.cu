@@ -195,8 +195,8 @@ __device__ __forceinline__ void sum_samples(const BackwardShared<kDepth, kErrors
         sums.uv += slope_u * f.y;
         sums.vv += slope_v * f.y;
         if constexpr (kDepth) sums.depth += weight * other.z;
+        if (kDensity && kErrors) sums.distance += weight * approximate_sqrt_flushed(f.x * f.x + f.y * f.y);
         if (kDensity) {
-            if (kErrors) sums.distance += weight * approximate_sqrt_flushed(f.x * f.x + f.y * f.y);
             sums.absolute_x += fabsf(slope_u);
             sums.absolute_y += fabsf(own.form.y * slope_u + own.form.z * slope_v);
             sums.square += slope * slope;
