@@ -50,13 +50,13 @@ class TurboDensityStrategy(DefaultStrategy):
     and may change at any time. Opacities are never reset; reset_every only says when pruning by size begins.
     grow_scale2d has no effect.
 
-    Gaussians grow and go by `squares`, here the sums of a view's squared absolute screen gradients. As many grow as
+    Gaussians grow and go by `squares`, here the sums over views of squared absolute screen gradients. As many grow as
     pass the threshold; which ones is drawn in proportion to squares. Once a line ``info.update(prediction=colors,
     ground_truth=pixels)`` stands before ``loss.backward()``, Gaussians are ranked by the error they carry (see
     `gaussian_errors`), as in the paper. The first step prints which of the two it is, and later steps must agree.
 
-    Defaults are values of `configs/turbogs.yaml`. Its share of opacity that an event takes, and of Gaussians, are meant
-    for 33 events; gsplat's 145 events take as much together.
+    Defaults are values of `configs/turbogs.yaml`. The shares of opacity and of Gaussians that an event takes are smaller
+    than there: gsplat's 145 events together take as much as 33 events of TurboGS.
 
     Args:
         absgrad: go by absolute gradients; render with ``absgrad=True`` then. Otherwise by the signed ones.
@@ -65,7 +65,7 @@ class TurboDensityStrategy(DefaultStrategy):
         grow_scale3d: percent_dense of `ErrorDrivenDensity`.
         top_fraction, opacity_decay: as of `ErrorDrivenDensity`; the former by errors alone.
         prune_score_fraction: as of `ErrorDrivenDensity`. None: 0.012 by squares, 0 by errors.
-        max_gaussians: never more, at any step.
+        max_gaussians: never more, from the first refinement on.
     """
 
     grow_grad2d: float = 2e-4
@@ -129,7 +129,8 @@ class TurboDensityStrategy(DefaultStrategy):
 
         Raises:
             InputError: the host trains in several processes; `state` is not one of `initialize_state`, or was not
-                carried along when rows changed; `info` lacks a key, or changed between having errors and none.
+                carried along when rows changed; `info` lacks a key, or changed between having errors and none; no
+                Gaussian is finite.
         """
         require_one_process("TurboDensityStrategy")
         if step >= self.refine_stop_iter:
