@@ -35,7 +35,8 @@ def test_its_defaults_are_the_values_of_turbogs():
         assert controller[name] == section[name] != vars(ErrorDrivenDensity())[name]
     for name, digits in (("opacity_decay", 2), ("prune_score_fraction", 3)):  # 145 events in the place of 33
         assert controller[name] == round(1 - (1 - section[name]) ** (33 / 145), digits)
-    assert controller["final_keep"] == 1.0 and TurboDensityStrategy()._controller(0, "error").prune_score_fraction == 0
+    assert (controller["final_keep"], controller["prune_world_size"]) == (1.0, 0.0)  # no end known, no size too large
+    assert TurboDensityStrategy()._controller(0, "error").prune_score_fraction == 0
 
 
 @dataclass
@@ -93,8 +94,7 @@ BASE_OF_CONTROLLER |= {"percent_dense": 0.17, "top_fraction": 0.5, "final_keep":
 """Settings of `ErrorDrivenDensity` by which the same happens as by `BASE`."""
 
 FIELDS = {"grow_grad2d": 0.001, "grow_absgrad2d": 0.05, "grow_scale3d": 0.2, "prune_opa": 0.4, "prune_scale3d": 0.16}
-FIELDS |= {"refine_every": 7, "top_fraction": 0.2, "max_gaussians": 45, "prune_score_fraction": 0.3}
-FIELDS |= {"opacity_decay": 0.1}
+FIELDS |= {"refine_every": 7, "top_fraction": 0.2, "max_gaussians": 45, "prune_score_fraction": 0.3, "opacity_decay": 0.1}
 """Field -> another value than its default."""
 
 RENAMED = {"grow_grad2d": "grad_threshold", "grow_absgrad2d": "absgrad_threshold", "grow_scale3d": "percent_dense"}

@@ -65,6 +65,7 @@ class TurboDensityStrategy(DefaultStrategy):
         grow_scale3d: percent_dense of `ErrorDrivenDensity`.
         top_fraction, opacity_decay: as of `ErrorDrivenDensity`; the former by errors alone.
         prune_score_fraction: as of `ErrorDrivenDensity`. None: 0.012 by squares, 0 by errors.
+        prune_scale3d: as gsplat's, whose default of 0.1 takes away sky and hills. 0: no Gaussian is too large.
         max_gaussians: never more, from the first refinement on.
     """
 
@@ -75,6 +76,7 @@ class TurboDensityStrategy(DefaultStrategy):
     top_fraction: float = 0.9
     max_gaussians: int = 0
     prune_score_fraction: float | None = None
+    prune_scale3d: float = 0.0
     opacity_decay: float = 0.11
 
     def __post_init__(self) -> None:
