@@ -59,9 +59,8 @@ def test_it_trains_and_says_once_what_drives_it(tells_errors, capsys, recwarn):
     losses = host.train(16)
     assert losses[-1] < losses[0] and len(host.splats["means"]) > 40
     host.assert_rows_match()
-    said = [line for line in capsys.readouterr().out.splitlines() if "TurboDensityStrategy" in line]
-    assert len(said) == 1
-    assert ("error-driven, by" in said[0], "driven by squares" in said[0]) == (tells_errors, not tells_errors)
+    (said,) = (line for line in capsys.readouterr().out.splitlines() if "TurboDensityStrategy" in line)
+    assert ("error-driven, by" in said, "driven by squares" in said) == (tells_errors, not tells_errors)
     assert any("grow_grad2d=1e-06 has no effect" in str(each.message) for each in recwarn) != tells_errors
 
 
@@ -94,7 +93,8 @@ BASE_OF_CONTROLLER |= {"percent_dense": 0.17, "top_fraction": 0.5, "final_keep":
 """Settings of `ErrorDrivenDensity` by which the same happens as by `BASE`."""
 
 FIELDS = {"grow_grad2d": 0.001, "grow_absgrad2d": 0.05, "grow_scale3d": 0.2, "prune_opa": 0.4, "prune_scale3d": 0.16}
-FIELDS |= {"refine_every": 7, "top_fraction": 0.2, "max_gaussians": 45, "prune_score_fraction": 0.3, "opacity_decay": 0.1}
+FIELDS |= {"refine_every": 7, "top_fraction": 0.2, "max_gaussians": 45, "prune_score_fraction": 0.3}
+FIELDS |= {"opacity_decay": 0.1}
 """Field -> another value than its default."""
 
 RENAMED = {"grow_grad2d": "grad_threshold", "grow_absgrad2d": "absgrad_threshold", "grow_scale3d": "percent_dense"}
