@@ -35,18 +35,8 @@ __global__ void __launch_bounds__(kSampleThreads, kSampleBlocks) sample_pixels_k
     const uint32_t view_number = static_cast<uint32_t>(params.views[pixels.view].view_number);
     const PixelUnits units = load_maps(params, pixels);
 
-    // The sums of the mixed stage: half-precision errors add up exactly in double.
-    double error_sum = 0.0;
-    int age_sum = 0;
     float missed[kPerLane];
-#pragma unroll
-    for (int j = 0; j < kPerLane; ++j) {
-        error_sum += static_cast<double>(units.error(j));
-        age_sum += units.age(j);
-    }
-    error_sum = warp_sum(error_sum);
-    age_sum = static_cast<int>(__reduce_add_sync(kFullWarp, static_cast<uint32_t>(age_sum)));
-    const uint32_t drawn = draw<kWeighted>(params, units, view_number, error_sum, age_sum, missed);
+    const uint32_t drawn = draw<kWeighted>(params, units, view_number, missed);
 
     const int first = kMasked ? tile * params.slots_per_tile : first_slot(params, pixels);
     const int end = first + (kMasked ? params.slots_per_tile : tile_slots(params, pixels.width, pixels.height));

@@ -50,19 +50,22 @@ __device__ __forceinline__ uint32_t race_key(float weight, uint32_t word) {
     return __float_as_uint(divide(fmaxf(weight, kWeightFloor), exponential(word)));
 }
 
-// What `race_key` is to about 1e-5, from a third of the instructions. The logarithm of the special function unit is
-// off by 2^-22 near 1, so there the first terms of a series take its place.
-constexpr uint32_t kKeyGuard = 512;  // units of the last place; over all random words the two differ by at most 182
+// The time of a key, the largest key's first: bits of a float near its reciprocal. Finite, as keys are below 2^41.
+__device__ __forceinline__ uint32_t race_time(uint32_t key) { return 0x7F000000u - key; }
+
+// The reciprocal of what `race_key` is, to about 1e-5, from a third of the instructions. The logarithm of the special
+// function unit is off by 2^-22 near 1, so there the first terms of a series take its place.
+constexpr uint32_t kTimeGuard = 512;  // units of the last place, 3.0e-5 or more; the two differ by 1.3e-5 at most
 constexpr float kSeriesBelow = 0.015625f;  // 2^-6, of 1 - u
 constexpr float kLn2 = 0.693147180559945f;
 constexpr float kUniformOffset = 0.999999940395355224609375f;  // 1 - 2^-24: u is an odd multiple of 2^-24
 
-__device__ __forceinline__ uint32_t approximate_race_key(float weight, uint32_t word) {
+__device__ __forceinline__ uint32_t approximate_race_time(float weight, uint32_t word) {
     const float u = __uint_as_float(0x3F800000u | word >> 9) - kUniformOffset;  // exact, as is 1 - u
     const float v = 1.0f - u;
     const float series = v * (1.0f + v * (0.5f + v * (1.0f / 3.0f)));
     const float exponential = v < kSeriesBelow ? series : -kLn2 * approximate_log2(u);
-    return __float_as_uint(fmaxf(weight, kWeightFloor) * approximate_reciprocal(exponential));
+    return __float_as_uint(exponential * approximate_reciprocal(fmaxf(weight, kWeightFloor)));
 }
 
 __device__ __forceinline__ uint64_t age_key(int age, uint32_t word) {

@@ -60,7 +60,8 @@ __device__ __forceinline__ TilePixels locate_tile(const SamplePixelsParams& para
 #pragma unroll
     for (int j = 0; j < kPerLane; ++j) {
         const int image_x = first_x + j % kRowPatches * kPatchWidth, image_y = first_y + j / kRowPatches * kPatchHeight;
-        const bool exists = image_x >= 0 && image_x < view.width && image_y >= 0 && image_y < view.height;
+        const bool in_row = static_cast<uint32_t>(image_x) < static_cast<uint32_t>(view.width);
+        const bool exists = in_row && static_cast<uint32_t>(image_y) < static_cast<uint32_t>(view.height);
         pixels.inside |= static_cast<uint32_t>(exists) << j;
     }
     if (kMasked) {
@@ -89,19 +90,19 @@ __device__ __forceinline__ PixelUnits load_maps(const SamplePixelsParams& params
     const int64_t first = view.pixel_base + pixels.first;
     const uint16_t* of_errors = params.errors + first;
     const int16_t* of_stamps = params.stamps + first;
-    uint16_t errors[kPerLane];
-    int16_t stamps[kPerLane];
+    uint32_t errors[kPerLane];
+    int stamps[kPerLane];
 #pragma unroll
     for (int j = 0; j < kPerLane; ++j) {
-        const bool exists = pixels.inside >> j & 1u;
-        errors[j] = exists ? of_errors[pixels.offset(j)] : uint16_t{0};
-        stamps[j] = exists ? of_stamps[pixels.offset(j)] : int16_t{0};
+        const bool exists = (pixels.inside & 1u << j) != 0u;
+        errors[j] = exists ? of_errors[pixels.offset(j)] : 0u;
+        stamps[j] = exists ? of_stamps[pixels.offset(j)] : params.now;
     }
     PixelUnits units{pixels, {}};
 #pragma unroll
     for (int j = 0; j < kPerLane; ++j) {
-        const int age = min(max(params.now - static_cast<int>(stamps[j]), 0), kAgeMax);
-        units.packed[j] = errors[j] | (pixels.inside >> j & 1u ? static_cast<uint32_t>(age) << 16 : 0u);
+        const int negative_age = min(max(stamps[j] - params.now, -kAgeMax), 0);
+        units.packed[j] = errors[j] + static_cast<uint32_t>(negative_age * -0x10000);
     }
     return units;
 }
@@ -117,7 +118,7 @@ __device__ __forceinline__ void write_samples(const SamplePixelsParams& params, 
     int next = first;
 #pragma unroll
     for (int j = 0; j < kPerLane; ++j) {
-        const bool mine = drawn >> j & 1u;
+        const bool mine = (drawn & 1u << j) != 0u;
         const uint32_t lanes = __ballot_sync(kFullWarp, mine);
         if (mine) {
             const int slot = next + __popc(lanes & lower_lanes);
