@@ -121,7 +121,6 @@ SWAPS = {
     "sparse": "sparse pixels, 4 views",
 }
 
-
 PASSED = (7000, 30000)
 """Steps of stock whose result the whole step is to pass; the last is the length of stock's run."""
 
@@ -147,17 +146,21 @@ def dropin() -> str:
             texts = (f"{end[name]:.{digits}f}" for name, digits in (("seconds", 1), ("psnr", 2), ("ssim", 4)))
             texts = (f"{end['step']:.0f}", *texts, f"{end['gaussians'] / 1e3:.0f}k")
             lines.append((scene, f"{SWAPS.get(variant, variant)} ({len(seeds)})", *texts, beside))
-        head = ("capture", "swap (seeds)", "steps", "s", "PSNR", "SSIM", "Gaussians", "PSNR beside stock's, equal time")
+        head = ("capture", "swap (seeds)", "steps", "s", "PSNR", "SSIM", "Gaussians", "beside stock at equal time")
         parts.append(f"{record['device']}, {record['date']}:\n\n{table(head, lines)}")
     return "\n\n".join(parts)
 
 
 def at_equal_time(stock: Sequence[Marks], ours: Sequence[Marks]) -> str:
-    """PSNR of both when the first of them has ended, on straight lines between evaluations."""
+    """Both measures when the first of them has ended, on straight lines between evaluations."""
     seconds = min(of[0][-1]["seconds"] for of in (stock, ours))
-    curves = ([[[mark[key] for mark in marks] for key in ("seconds", "psnr")] for marks in of] for of in (stock, ours))
-    theirs, own = (statistics.fmean(float(np.interp(seconds, *curve)) for curve in of) for of in curves)
-    return f"{own - theirs:+.2f} dB: {own:.2f} for {theirs:.2f} at {seconds:.0f} s"
+
+    def mean(of: Sequence[Marks], name: str) -> float:
+        curves = ([[mark[key] for mark in marks] for key in ("seconds", name)] for marks in of)
+        return statistics.fmean(float(np.interp(seconds, *curve)) for curve in curves)
+
+    theirs, own, gain = mean(stock, "psnr"), mean(ours, "psnr"), mean(ours, "ssim") - mean(stock, "ssim")
+    return f"{own - theirs:+.2f} dB, {gain:+.4f}: {own:.2f} for {theirs:.2f} dB at {seconds:.0f} s"
 
 
 def sooner(stock: Sequence[Marks], ours: Sequence[Marks], step: float) -> tuple[float, float]:
