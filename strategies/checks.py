@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
-from numbers import Real
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from torch import Tensor
 
-from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.errors import InputError, is_number, require
 from turbogs_plugin.types import PixelSamples
 
 
@@ -21,11 +20,11 @@ def require_settings(instance: Any) -> None:
     hints = get_type_hints(type(instance))
     for name in [field.name for field in fields(instance) if field.init]:
         value, hint = vars(instance)[name], hints[name]
-        real, classed = isinstance(value, Real), hint is bool or is_dataclass(hint)
+        classed = hint is bool or is_dataclass(hint)
         if get_origin(hint) is Literal:
             require(value in get_args(hint), name, value, f"one of {', '.join(get_args(hint))}")
         elif hint in (int, float):
-            valid = real and 0 <= value < math.inf and (hint is float or value % 1 == 0)
+            valid = is_number(value, whole=hint is int) and 0 <= value < math.inf
             require(valid, name, value, f"a {'whole' if hint is int else 'finite'} number >= 0")
         elif classed:
             require(isinstance(value, hint), name, value, f"a {hint.__name__}")
@@ -35,7 +34,7 @@ def require_each(instance: Any, valid: Callable[[Any], bool], allowed: str, *nam
     """Raise `InputError` unless each of these attributes is a `valid` number; `allowed` describes the valid ones."""
     for name in names:
         value = vars(instance)[name]
-        require(isinstance(value, Real) and valid(value), name, value, allowed)
+        require(is_number(value) and valid(value), name, value, allowed)
 
 
 def require_at_least_one(instance: Any, *names: str) -> None:

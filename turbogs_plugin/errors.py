@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterable
+from numbers import Real
 
 LONGEST_LINE = 1200
 """Letters of an error's line: names and values of a file may have any number of them."""
@@ -26,6 +27,11 @@ def require(valid: bool, field: str, value: object, allowed: str) -> None:
     """Raise `InputError` unless `valid`, with one line: which field, its value, what is allowed."""
     if not valid:
         raise InputError(f"{field} = {value!r} is not valid: it must be {allowed}")
+
+
+def is_number(value: object, whole: bool = False) -> bool:
+    """Whether a value is a real number, perhaps a whole one: 12.0 and numpy's are, a bool is not."""
+    return isinstance(value, Real) and not isinstance(value, bool) and (not whole or value % 1 == 0)
 
 
 def nearest(name: object, known: Iterable[str]) -> str:

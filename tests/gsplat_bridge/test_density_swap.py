@@ -81,6 +81,9 @@ def test_schedule_events_happen_where_gsplats_do():
         host = Host(cls(refine_start_iter=3, refine_every=3, refine_stop_iter=12, **{threshold: 1e-9}))
         counts = [40, *(len(host.splats["means"]) for step in range(16) if host.step(step))]
         assert [step for step in range(16) if counts[step + 1] != counts[step]] == [6, 9]
+    host = Host(TurboDensityStrategy(refine_start_iter=3, refine_every=3, refine_stop_iter=12))
+    host.train(4)
+    assert float(host.state["view_counts"].max()) == 4 * 3  # steps times cameras: step 3 keeps the window
 
 
 EVENT = 3
@@ -93,8 +96,7 @@ BASE_OF_CONTROLLER |= {"percent_dense": 0.17, "top_fraction": 0.5, "final_keep":
 """Settings of `ErrorDrivenDensity` by which the same happens as by `BASE`."""
 
 FIELDS = {"grow_grad2d": 0.001, "grow_absgrad2d": 0.05, "grow_scale3d": 0.2, "prune_opa": 0.4, "prune_scale3d": 0.16}
-FIELDS |= {"refine_every": 7, "top_fraction": 0.2, "max_gaussians": 45, "prune_score_fraction": 0.3}
-FIELDS |= {"opacity_decay": 0.1}
+FIELDS |= {"refine_every": 7, "top_fraction": 0.2, "max_gaussians": 45, "prune_score_fraction": 0.3, "opacity_decay": 0}
 """Field -> another value than its default."""
 
 RENAMED = {"grow_grad2d": "grad_threshold", "grow_absgrad2d": "absgrad_threshold", "grow_scale3d": "percent_dense"}
@@ -114,6 +116,22 @@ def test_fields_are_the_controllers_settings_whenever_they_change():
     assert controller.prune_screen_size == 0.0  # gsplat's rule is off where refine_scale2d_stop_iter is 0
     strategy.refine_scale2d_stop_iter = 5
     assert [strategy._controller(step).prune_screen_size for step in (4, 5)] == [0.2, 0.0]
+
+
+WRONG = {"revised_opacity": True, "key_for_gradient": "x", "absgrad": "False", "verbose": None, "prune_opa": 1.0}
+WRONG |= {"grow_absgrad2d": -1.0, "grow_grad2d": "x", "prune_scale2d": True, "reset_every": -1, "refine_every": 0}
+WRONG |= {"refine_start_iter": 1.5, "refine_stop_iter": None, "refine_scale2d_stop_iter": "x"}
+
+
+def test_fields_that_cannot_be_are_refused_by_name_whenever_they_change():
+    for name, value in WRONG.items():
+        strategy = TurboDensityStrategy()
+        setattr(strategy, name, value)
+        for hook in (strategy.step_pre_backward, strategy.step_post_backward):
+            assert_refused(f"^{name} = {value!r} is", hook, {}, {}, {}, 0, {})
+    for name, value in {**WRONG, "max_gaussians": True, "opacity_decay": False}.items():
+        assert_refused(f"^{name} = {value!r} is", TurboDensityStrategy, **{name: value})
+    assert TurboDensityStrategy(refine_start_iter=-5)._controller(0).refine_from == 0
 
 
 def controlled(before, window, extent, rule):
@@ -249,20 +267,15 @@ def test_what_does_not_fit_is_refused_by_name():
     assert_refused(r"means2d'\] has no gradient", post, *common, state, 1, host.info)
     host.tells_errors, host.state["grad_sums"] = False, host.state["grad_sums"][:7]
     assert_refused(r"state\['grad_sums'\] has 7 rows, the parameters 40", host.step, 1)
-    for name, value in (("revised_opacity", True), ("key_for_gradient", "x"), ("grow_absgrad2d", -1.0)):
-        assert_refused(name, TurboDensityStrategy, **{name: value})
     assert Host(TurboDensityStrategy(**SOON, absgrad=False)).train(4)
     with pytest.warns(UserWarning, match="pause_refine_after_reset=5 has no effect"):
         TurboDensityStrategy(pause_refine_after_reset=5)
-
-
-@pytest.mark.parametrize("tells_errors", [False, True])
-def test_info_of_another_model_is_refused(tells_errors):
-    host = Host(TurboDensityStrategy(**SOON), tells_errors=tells_errors)
-    host.step(0)
-    other, state = {name: value.detach()[:7] for name, value in host.splats.items()}, host.strategy.initialize_state()
-    words = "info is of 40 Gaussians, the parameters are 7: pass the info of this step"
-    assert_refused(words, host.strategy.step_post_backward, other, host.optimizers, state, 1, host.info)
+    for tells_errors in (False, True):
+        host = Host(TurboDensityStrategy(**SOON), tells_errors=tells_errors)
+        host.step(0)
+        few, state = {name: value.detach()[:7] for name, value in host.splats.items()}, host.strategy.initialize_state()
+        words = "info is of 40 Gaussians, the parameters are 7: pass the info of this step"
+        assert_refused(words, host.strategy.step_post_backward, few, host.optimizers, state, 1, host.info)
 
 
 def test_values_of_the_host_in_the_state_go_from_parent_to_child():
@@ -306,9 +319,8 @@ def test_several_renders_a_step(together):
     for step in range(7):
         infos = []
         for _ in range(2):
-            colors, _, info = sparse_rasterization(
-                **arguments(host.splats, host.cameras), samples=host.samples, sh_degree=1, absgrad=True
-            )
+            given = arguments(host.splats, host.cameras) | {"samples": host.samples, "sh_degree": 1}
+            colors, _, info = sparse_rasterization(**given, absgrad=True)
             host.strategy.step_pre_backward(host.splats, host.optimizers, host.state, step, info)
             torch.nn.functional.l1_loss(colors, host.pixels).backward()
             infos.append(info)
@@ -317,9 +329,3 @@ def test_several_renders_a_step(together):
         if step == 0:
             assert float(host.state["view_counts"].max()) == 2 * 3  # renders times cameras
     assert len(host.splats["means"]) > 40
-
-
-def test_the_step_where_gsplat_does_not_refine_yet_keeps_the_window():
-    host = Host(TurboDensityStrategy(refine_start_iter=3, refine_every=3, refine_stop_iter=12))
-    host.train(4)
-    assert float(host.state["view_counts"].max()) == 4 * 3  # steps times cameras

@@ -42,13 +42,9 @@ def host() -> dict[str, Any]:
         "pixels": images[[1, 0]],
         "photos": images,
         "trainset": [{"image": 255.0 * image} for image in images],
-        "device": "cpu",
-        "sh_degree": 1,
         "strategy": SimpleNamespace(absgrad=True),
-        "rate": 0.25,
-        "max_steps": 10,
-        "step": 3,
     }
+    names |= {"device": "cpu", "sh_degree": 1, "rate": 0.25, "max_steps": 10, "step": 3}
     exec(block("python", "sampler = "), names)
     torch.testing.assert_close(names["maps"].errors, images.sum(dim=-1).flatten().half(), rtol=2e-3, atol=0)
     return names

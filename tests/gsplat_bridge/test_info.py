@@ -43,9 +43,8 @@ def gsplat_info(splats, cameras, pixels):
     colors, _, _ = gsplat_torch_render(gaussians, cameras, dense_samples(cameras), sh_degree=1, drawn=drawn)
     torch.nn.functional.l1_loss(colors, pixels.double()).backward()
     covariances, _ = _quat_scale_to_covar_preci(gaussians.quats, gaussians.scales.exp(), compute_preci=False)
-    _, means2d, depths, conics, _ = _fully_fused_projection(
-        gaussians.means, covariances, cameras.viewmats, cameras.Ks, WIDTH, HEIGHT
-    )
+    seen = (gaussians.means, covariances, cameras.viewmats, cameras.Ks)
+    _, means2d, depths, conics, _ = _fully_fused_projection(*seen, WIDTH, HEIGHT)
     radii = gsplat_radii(means2d, depths, conics, torch.sigmoid(gaussians.opacities).expand(depths.shape))
     means2d = means2d.float().requires_grad_()
     means2d.grad, means2d.absgrad = torch.zeros_like(means2d), torch.zeros_like(means2d)

@@ -88,12 +88,9 @@ def test_masks_that_leave_no_pixel_are_refused_and_one_of_several_is_not():
 
 def test_what_is_no_data_set_of_images_is_refused_by_name():
     good, place = {"image": torch.zeros(20, 30, 3)}, r"^trainset\[1\]\['image'\] is"
-    refused = {
-        rf"{place} ndarray: expected a tensor \[H, W, 3\]": [good, {"image": np.zeros((20, 30, 3))}],
-        "trainset needs whole images, its patch_size is 8": Photos(torch.zeros(2, 8, 8, 3), patch_size=8),
-    }
-    for words, trainset in refused.items():
-        assert_refused(words, maps_of_photos, trainset)
+    array, patches = {"image": np.zeros((20, 30, 3))}, Photos(torch.zeros(2, 8, 8, 3), patch_size=8)
+    assert_refused(rf"{place} ndarray: expected a tensor \[H, W, 3\]", maps_of_photos, [good, array])
+    assert_refused("trainset needs whole images, its patch_size is 8", maps_of_photos, patches)
     for value in (torch.nan, -torch.inf):
         broken = {"image": torch.tensor([value, 2.0, 3.0]).expand(20, 30, 3)}
         assert_refused(r"^trainset\[1\]\['image'\] has values that are not finite", maps_of_photos, [good, broken])

@@ -139,6 +139,10 @@ def with_item(**changes: Any) -> list[dict[str, Any]]:
     return [{key: value for key, value in view.items() if value is not None} for view in views]
 
 
+WRONG = {"max_steps": (0, 12.5, torch.inf, True, "x"), "scene_scale": (-1.0, torch.nan, True, "x"), "rates": (0,)}
+WRONG |= {"white": (0, torch.inf, None), "config": (None, 3)}
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -159,8 +163,11 @@ def with_item(**changes: Any) -> list[dict[str, Any]]:
         ({"splats": {"shN": torch.zeros(40, 5, 3)}}, "bands of shN = 5"),
         ({"splats": {"scales": torch.zeros(39, 3)}}, r"'scales' has shape \(39, 3\): expected \[N, 3\] with N = 40"),
         ({"rates": ("means",)}, "optimizers has no 'means'"),
-        ({"max_steps": 0}, "max_steps = 0"),
-        ({"scene_scale": -1.0}, "scene_scale = -1.0"),
+        ({"splats": {"opacities": torch.arange(40.0).log()}}, r"\['opacities'\]: 1 of 40 Gaussians are not finite"),
+        ({"optimizers": []}, "type of optimizers = <class 'list'> is not valid"),
+        ({"scene": "garden"}, "type of scene = <class 'str'> is not valid"),
+        ({"overrides": None}, "an override = None is not valid: it must be text of the form section.key=value"),
+        *(({name: value}, f"^{name} = {value!r} is") for name, values in WRONG.items() for value in values),
         ({"overrides": ("train.exposure=true",)}, "train.exposure is TurboStep's own: .* no exposures; leave it out"),
         ({"overrides": " scene.factor =2"}, "scene.factor is TurboStep's own: views, .* are the host's"),
     ],
@@ -177,7 +184,9 @@ def test_what_cannot_be_done_is_refused_by_name(arguments, words):
 
 def test_steps_states_and_rows_that_do_not_fit_are_refused():
     config = type("Config", (), {"strategy": DefaultStrategy(), "batch_size": 1})
-    turbo = TurboStep(make_splats(), make_views(), max_steps=STEPS, options=config, overrides=SMALL)
+    assert_refused("type of options = .class 'dict'", TurboStep, make_splats(), make_views(), options={"batch_size": 4})
+    assert_refused("type of splats = <class 'list'>", TurboStep, [*make_splats().values()], make_views())
+    turbo = TurboStep(make_splats(), make_views(), torch.tensor(1.0), STEPS, options=config, overrides=SMALL)
     assert config.strategy.refine_stop_iter == 0
     turbo.step(0)
     for step in (0, 2, STEPS):
@@ -190,9 +199,8 @@ def test_steps_states_and_rows_that_do_not_fit_are_refused():
 
 
 def test_poses_in_other_axes_are_told_at_the_first_step():
-    views = [
-        view | {"camtoworld": view["camtoworld"] @ torch.diag(torch.tensor([1.0, -1, -1, 1]))} for view in make_views()
-    ]
+    turn = torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    views = [view | {"camtoworld": view["camtoworld"] @ turn} for view in make_views()]
     turbo = TurboStep(make_splats(), views, max_steps=STEPS, overrides=SMALL[0])
     with pytest.warns(UserWarning, match="no sample of the first step shows a Gaussian: camtoworld must be"):
         turbo.step(0)
@@ -205,6 +213,8 @@ def test_our_length():
     assert several == TurboStep.proposed_steps(40, overrides="train.epochs=70") != TurboStep.proposed_steps(40)
     assert TurboStep.proposed_steps(40, overrides="train.iterations=500") == 500  # as long as it is without max_steps
     assert_refused("train.seed is TurboStep's own", TurboStep.proposed_steps, 40, overrides="train.seed=1")
+    for count in (0, 2.5, True, None):
+        assert_refused(f"^num_views = {count} is not valid: it must be a whole", TurboStep.proposed_steps, count)
 
 
 def test_iterations_that_had_too_little_memory_are_made_again(monkeypatch):

@@ -12,13 +12,9 @@ from turbogs_plugin.gsplat_bridge import TurboDensityStrategy
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats
 
 
-@pytest.fixture
-def rendered():
-    return rendered_info()
-
-
 @pytest.mark.parametrize("packed", [False, True])
-def test_it_gives_the_sums_that_our_rasterizer_gives(rendered, packed, monkeypatch):
+def test_it_gives_the_sums_that_our_rasterizer_gives(packed, monkeypatch):
+    rendered = rendered_info()
     info, camera_of = stock_info(rendered, packed)
     monkeypatch.setattr(gsplat, "rasterize_to_pixels", stand_in(camera_of))
     (expected, _), (actual, has_errors) = iteration_stats(rendered, COUNT), iteration_stats(info, COUNT)
@@ -77,12 +73,12 @@ def test_errors_of_masked_pixels_count_unless_the_photo_is_black_there_too(monke
     densified(black)
 
 
-def test_info_that_does_not_fit_is_refused(rendered, monkeypatch):
+def test_info_that_does_not_fit_is_refused(monkeypatch):
     """A render with the unscented transform leaves no gradient on the screen; its weights are not splats'."""
     pre, flat = TurboDensityStrategy().step_pre_backward, {"means2d": torch.zeros(1, 40, 2)}
     assert_refused("takes no gradient, as from a render with with_ut", pre, {}, {}, {}, 0, flat)
     small = dict.fromkeys(("prediction", "ground_truth"), torch.zeros(CAMERAS, 5, 5, 3))
     words = r"of shape \(\d, 5, 5, 3\): expected \(\d, 24, 40, 3\), what gsplat"
     assert_refused(words, iteration_stats, stock(monkeypatch) | small, COUNT)
-    late = {key: value for key, value in rendered.items() if key != "gaussian_stats"}
+    late = {key: value for key, value in rendered_info().items() if key != "gaussian_stats"}
     assert_refused("put them in before backward", iteration_stats, late, COUNT)

@@ -29,7 +29,7 @@ from turbogs_plugin.config.sections import (
 )
 from turbogs_plugin.config.typed import build_dataclass, dataclass_mapping, settings_of
 from turbogs_plugin.engine.render_pass import DEFAULT_SETTINGS, RasterSettings
-from turbogs_plugin.errors import InputError, nearest
+from turbogs_plugin.errors import InputError, nearest, require
 from turbogs_plugin.strategies import TYPES
 from turbogs_plugin.yaml_json import packaged_names, parse_yaml, read_named_yaml, yaml_text
 
@@ -107,6 +107,7 @@ def load_config(source: str | Mapping[str, Any] = DEFAULT_CONFIG, overrides: Seq
         own = dict(source)
         mapping = _merge(_load_mapping(str(own.pop("base", DEFAULT_CONFIG))), own)
     else:
+        require(isinstance(source, str | Path), "config", source, "a packaged name or a YAML file")
         mapping = _load_mapping(source)
     return resolve(apply_overrides(mapping, overrides))
 

@@ -80,14 +80,25 @@ class TurboDensityStrategy(DefaultStrategy):
     opacity_decay: float = 0.11
 
     def __post_init__(self) -> None:
-        require(not self.revised_opacity, "revised_opacity", self.revised_opacity, "False: splits copy the opacity")
-        pause, key = self.pause_refine_after_reset, self.key_for_gradient
-        if pause:
+        if pause := self.pause_refine_after_reset:
             warnings.warn(f"pause_refine_after_reset={pause} has no effect: opacities are never reset", stacklevel=3)
-        require(key == "means2d", "key_for_gradient", key, "'means2d': error sums are of 3D Gaussians")
-        thresholds = ("grow_grad2d", "grow_absgrad2d", "grow_scale3d", "prune_opa", "prune_scale2d", "prune_scale3d")
-        require_each(self, lambda value: 0 <= value < math.inf, "a finite number >= 0", *thresholds)
+        self._require_fields()
         self._controller(0)  # checks the rest
+
+    def _require_fields(self) -> None:
+        """Raise `InputError` for a field of another type or out of bounds, by name: hosts change them at any time."""
+        require(not self.revised_opacity, "revised_opacity", self.revised_opacity, "False: splits copy the opacity")
+        key = self.key_for_gradient
+        require(key == "means2d", "key_for_gradient", key, "'means2d': error sums are of 3D Gaussians")
+        for name in ("absgrad", "verbose"):
+            require(vars(self)[name] in (False, True), name, vars(self)[name], "True or False")
+        thresholds = ("grow_grad2d", "grow_absgrad2d", "grow_scale3d", "prune_scale2d", "prune_scale3d")
+        require_each(self, lambda value: 0 <= value < math.inf, "a finite number >= 0", *thresholds)
+        require_each(self, lambda value: 0 <= value < 1, "at least 0 and less than 1", "prune_opa")
+        require_each(self, lambda value: value >= 0 and value % 1 == 0, "a whole number >= 0", "reset_every")
+        require_each(self, lambda value: value >= 1 and value % 1 == 0, "a whole number >= 1", "refine_every")
+        iterations = ("refine_start_iter", "refine_stop_iter", "refine_scale2d_stop_iter")
+        require_each(self, lambda value: value % 1 == 0, "a whole number", *iterations)
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """The running state, to be passed to both hooks: `GaussianStats`' tensors by name, once the first step made
@@ -103,8 +114,9 @@ class TurboDensityStrategy(DefaultStrategy):
     def step_pre_backward(
         self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int, info: dict[str, Any]
     ) -> None:
-        """To be called before ``loss.backward()``. Raises `InputError`: `info` lacks ``means2d`` with a gradient."""
+        """To be called before ``loss.backward()``. Raises `InputError`: a wrong field; `info` without a gradient."""
         require_one_process("TurboDensityStrategy")
+        self._require_fields()
         require_keys(info, ("means2d",), "info", "pass what the rasterization returned")
         if not info["means2d"].requires_grad:
             raise InputError(WITHOUT_GRADIENT)
@@ -130,11 +142,12 @@ class TurboDensityStrategy(DefaultStrategy):
             packed, host_options: not used. scene: of gsplat from 1.6 on, a container with more arrays over Gaussians.
 
         Raises:
-            InputError: the host trains in several processes; `state` is not one of `initialize_state`, or was not
-                carried along when rows changed; `info` lacks a key, or changed between having errors and none; no
-                Gaussian is finite.
+            InputError: a field is not valid; the host trains in several processes; `state` is not one of
+                `initialize_state`, or was not carried along when rows changed; `info` lacks a key, or changed between
+                having errors and none; no Gaussian is finite.
         """
         require_one_process("TurboDensityStrategy")
+        self._require_fields()
         if step >= self.refine_stop_iter:
             return
         gaussians = host_gaussians(params, GEOMETRY)
@@ -161,10 +174,8 @@ class TurboDensityStrategy(DefaultStrategy):
         state["refined"] = step
         apply_row_update(in_order_of_space(update, gaussians, now), params, optimizers, state, scene)
         if self.verbose:
-            print(
-                f"Step {step}: {update.num_cloned} GSs duplicated, {update.num_split} split, "
-                f"{update.num_pruned} pruned. Now having {len(params['means'])} GSs."
-            )
+            grown = f"{update.num_cloned} GSs duplicated, {update.num_split} split"
+            print(f"Step {step}: {grown}, {update.num_pruned} pruned. Now having {len(params['means'])} GSs.")
 
     def _accumulate(self, state: dict[str, Any], info: dict[str, Any], count: int) -> GaussianStats:
         """Add this iteration's statistics to those in `state`; returns the latter."""
@@ -175,10 +186,8 @@ class TurboDensityStrategy(DefaultStrategy):
         if state["driven_by"] is None:
             print(f"TurboDensityStrategy: {_ANNOUNCEMENTS[driven_by]}.")
             if self.absgrad and not has_errors and self.grow_grad2d != TurboDensityStrategy.grow_grad2d:
-                ignored = f"grow_grad2d={self.grow_grad2d:g} has no effect"
-                warnings.warn(
-                    f"{ignored}: set grow_absgrad2d, or go by signed gradients by absgrad=False", stacklevel=3
-                )
+                remedy = "set grow_absgrad2d, or go by signed gradients by absgrad=False"
+                warnings.warn(f"grow_grad2d={self.grow_grad2d:g} has no effect: {remedy}", stacklevel=3)
             state.update(vars(GaussianStats.zeros(count, stats.view_counts.device)), driven_by=driven_by)
         if state["driven_by"] != driven_by:
             remedy = f"put '{PREDICTION}' and '{GROUND_TRUTH}' into info at every step, or at none"
@@ -204,7 +213,7 @@ class TurboDensityStrategy(DefaultStrategy):
         by_errors, removed = driven_by == "error", self.prune_score_fraction
         return ErrorDrivenDensity(
             **{name: getattr(self, name) for name in same},
-            refine_from=self.refine_start_iter + 1,
+            refine_from=max(0, self.refine_start_iter + 1),
             grad_threshold=self.grow_grad2d,
             absgrad_threshold=self.grow_absgrad2d if self.absgrad else self.grow_grad2d,
             percent_dense=self.grow_scale3d,

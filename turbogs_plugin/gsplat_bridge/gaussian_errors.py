@@ -26,8 +26,7 @@ from turbogs_plugin.types import GaussianStats
 
 WITHOUT_GRADIENT = (
     "info['means2d'] takes no gradient, as from a render with with_ut or with_eval3d, or under no_grad: "
-    "TurboDensityStrategy needs it; render without these options, or keep gsplat's "
-    "MCMCStrategy"
+    "TurboDensityStrategy needs it; render without these options, or keep gsplat's MCMCStrategy"
 )
 RENDERED = "pass what the rasterization returned"
 
@@ -41,10 +40,8 @@ def residuals(info: dict[str, Any]) -> Tensor | None:
     require_keys(info, (PREDICTION, GROUND_TRUTH), "info", f"'{present[0]}' is there, error-driven control needs both")
     prediction, truth = info[PREDICTION].detach(), info[GROUND_TRUTH].detach()
     if prediction.shape != truth.shape or prediction.shape[-1] != 3:
-        raise InputError(
-            f"info['{PREDICTION}'] has shape {tuple(prediction.shape)}, info['{GROUND_TRUTH}'] {tuple(truth.shape)}: "
-            "expected both [C, H, W, 3], or both [P, 3] with sparse pixels"
-        )
+        found = f"info['{PREDICTION}'] has shape {tuple(prediction.shape)}, info['{GROUND_TRUTH}'] {tuple(truth.shape)}"
+        raise InputError(f"{found}: expected both [C, H, W, 3], or both [P, 3] with sparse pixels")
     errors = (prediction - truth).abs().sum(dim=-1)
     return errors[None] if errors.dim() == 2 else errors  # of one image [H, W, 3]
 
@@ -127,10 +124,8 @@ def zero_channel_sums(info: dict[str, Any], upstream: Tensor) -> Tensor:
     if means2d.grad is None and not means2d.requires_grad:
         raise InputError(WITHOUT_GRADIENT)
     if upstream.shape[:-1] != images:
-        raise InputError(
-            f"info['{PREDICTION}'] and info['{GROUND_TRUTH}'] are of shape {(*upstream.shape[:-1], 3)}: "
-            f"expected {(*images, 3)}, what gsplat.rasterization rendered"
-        )
+        found = f"info['{PREDICTION}'] and info['{GROUND_TRUTH}'] are of shape {(*upstream.shape[:-1], 3)}"
+        raise InputError(f"{found}: expected {(*images, 3)}, what gsplat.rasterization rendered")
     means2d, conics, opacities = (value.detach() for value in (means2d, info["conics"], info["opacities"]))
     with torch.enable_grad():
         channels = means2d.new_zeros(*means2d.shape[:-1], upstream.shape[-1]).requires_grad_()

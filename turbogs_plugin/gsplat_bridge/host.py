@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from turbogs_plugin.errors import InputError
+from turbogs_plugin.errors import InputError, require
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians
 from turbogs_plugin.types.gaussians import ROW_SHAPES
 
@@ -38,6 +38,7 @@ IN_IMAGES: dict[str, Any] = {
 def require_options(options: Any, nothing: Mapping[str, Any], swap: str) -> None:
     """Raise `InputError` where the options of a host (as gsplat's `Config`, or None) ask for what has no effect with a
     swap. nothing: name of an option -> the value that asks for nothing."""
+    require(type(options) not in (dict, list, str, bool, int), "type of options", type(options), "gsplat's Config")
     for name, value in nothing.items():
         if (found := getattr(options, name, value)) != value:
             raise InputError(f"{name}={found!r} does not work with {swap}: leave it out")

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.errors import InputError, is_number, require
 from turbogs_plugin.gsplat_bridge.host import require_keys
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.scene import Photos, PosedImages
@@ -37,6 +37,7 @@ def read_items(
     """
     if not (hasattr(trainset, "__len__") and hasattr(trainset, "__getitem__")):
         raise InputError(f"{name} is a {type(trainset).__name__}: expected a data set with items by number, no loader")
+    require(is_number(white) and 0 < white < float("inf"), "white", white, "above 0 and finite")
     require(len(trainset) > 0, f"length of {name}", len(trainset), "1 or more photos")
     if getattr(trainset, "patch_size", None) is not None:
         raise InputError(f"{name} needs whole images, its patch_size is {trainset.patch_size}: leave patch_size out")

@@ -4,7 +4,7 @@ everything around the step is the host's."""
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,7 +16,7 @@ from torch import Tensor
 from turbogs_plugin.config.configuration import DEFAULT_CONFIG, Config, load_config, refuse_overrides
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.error_maps import LaggedCopy
-from turbogs_plugin.errors import InputError, require
+from turbogs_plugin.errors import InputError, is_number, require
 from turbogs_plugin.gsplat_bridge.density_swap import apply_row_update
 from turbogs_plugin.gsplat_bridge.host import (
     IN_IMAGES,
@@ -101,7 +101,7 @@ class TurboStep:
             several, of any setting but `OWN_SETTINGS`.
 
     Raises:
-        InputError: several processes; an option, override or parameter without support; or views of another form.
+        InputError: several processes; an option, override or parameter without support; or an argument of another form.
     """
 
     def __init__(
@@ -127,12 +127,16 @@ class TurboStep:
         elif strategy is not None:
             name = type(strategy).__name__
             raise InputError(f"strategy {name} would change the Gaussians beside TurboStep: use DefaultStrategy")
+        require(isinstance(splats, MutableMapping | torch.nn.ParameterDict), "type of splats", type(splats), "a dict")
+        require(isinstance(optimizers, Mapping | None), "type of optimizers", type(optimizers), "a dict or None")
+        require(scene is None or hasattr(scene, "on_remove"), "type of scene", type(scene), "gsplat's Scene, or None")
+        require(isinstance(rates, Collection | None), "rates", rates, "names of parameters")
         self.splats, self.optimizers, self.scene = splats, {} if optimizers is None else optimizers, scene
         gaussians = self._checked()
         device, settings = gaussians.device, host_settings(config, overrides)
         settings.train.sh_degree = gaussians.sh_degree
         if max_steps is not None:
-            require(max_steps >= 1, "max_steps", max_steps, "at least 1")
+            require(is_number(max_steps, whole=True) and max_steps >= 1, "max_steps", max_steps, "a whole number >= 1")
             settings = with_iterations(settings, int(max_steps))
         world = scene_of(posed_images(views, white), gaussians, scene_scale)
         settings = make_plan(settings, world, device).apply(settings)
@@ -152,6 +156,7 @@ class TurboStep:
     @staticmethod
     def proposed_steps(num_views: int, config: str = DEFAULT_CONFIG, overrides: Sequence[str] = ()) -> int:
         """The length that we propose for this number of training views."""
+        require(is_number(num_views, whole=True) and num_views >= 1, "num_views", num_views, "a whole number >= 1")
         facts = SceneFacts(num_views, 0.0, 0, 0, "cpu", 0, 0)
         return int(decide("iterations", facts, host_settings(config, overrides)).value)
 
@@ -261,6 +266,10 @@ class TurboStep:
             if parameter.dim() == 0 or len(parameter) != len(gaussians):
                 expected = f"{len(gaussians)} rows, one a Gaussian; keep other parameters elsewhere"
                 raise InputError(f"splats['{name}'] has shape {tuple(parameter.shape)}: expected {expected}")
+            lost = int((~parameter.isfinite())[:, None].flatten(1).any(dim=1).sum())
+            if lost and role_of(name, self.splats) in PARAMETER_NAMES:
+                remedy = "mend or remove them"
+                raise InputError(f"splats['{name}']: {lost} of {len(gaussians)} Gaussians are not finite: {remedy}")
             if parameter.requires_grad and role_of(name, self.splats) not in {*self.optimizers, *PARAMETER_NAMES}:
                 remedy = "give optimizers, whose rows then follow"
                 raise InputError(f"splats['{name}'] is trained by an optimizer of the host: {remedy}")
@@ -326,7 +335,9 @@ class HostRates(LearningRates):
 
 def host_settings(config: str, overrides: Sequence[str]) -> Config:
     """The settings of a training in a host. Raises `InputError` for an override of one of `OWN_SETTINGS`."""
-    overrides = [overrides] if isinstance(overrides, str) else list(overrides)
+    overrides = list(overrides) if isinstance(overrides, Iterable) and not isinstance(overrides, str) else [overrides]
+    for override in overrides:
+        require(isinstance(override, str), "an override", override, "text of the form section.key=value")
     refuse_overrides(overrides, OWN_SETTINGS)
     return load_config(config, (*overrides, "train.exposure=false", "train.init=points"))
 
@@ -335,7 +346,8 @@ def scene_of(images: PosedImages, gaussians: Gaussians, scale: float | None) -> 
     """A scene of a host's views, in the host's world, with its Gaussians as points and no test views."""
     points = gaussians.means.cpu()
     frame = Frame.around(images.cameras.centers.double().numpy(), points.double().numpy())
-    extent = frame.scale if scale is None else float(scale)
-    require(0 < extent < float("inf"), "scene_scale", scale, "above 0 and finite")
+    extent = frame.scale if scale is None else scale.item() if isinstance(scale, Tensor) else scale
+    require(is_number(extent) and 0 < extent < float("inf"), "scene_scale", scale, "above 0 and finite")
     nothing = replace(images, cameras=images.cameras.select(()), names=(), masks=None)
-    return Scene("host", images, nothing, points, torch.zeros(len(points), 3, dtype=torch.uint8), frame, extent)
+    colors = torch.zeros(len(points), 3, dtype=torch.uint8)
+    return Scene("host", images, nothing, points, colors, frame, float(extent))
