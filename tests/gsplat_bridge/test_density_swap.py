@@ -193,8 +193,7 @@ def test_a_host_in_double_precision_trains(tells_errors):
     host = Host(TurboDensityStrategy(**SOON), tells_errors=tells_errors, splats=torch.nn.ParameterDict(splats))
     host.cameras, host.pixels = host.cameras.to(dtype=torch.float64), host.pixels.double()
     host.train(6)
-    assert len(host.splats["means"]) > 40
-    assert {value.dtype for value in host.splats.values()} == {torch.float64}
+    assert len(host.splats["means"]) > 40 and {value.dtype for value in host.splats.values()} == {torch.float64}
     host.assert_rows_match()
 
 
@@ -276,6 +275,8 @@ def test_what_does_not_fit_is_refused_by_name():
         few, state = {name: value.detach()[:7] for name, value in host.splats.items()}, host.strategy.initialize_state()
         words = "info is of 40 Gaussians, the parameters are 7: pass the info of this step"
         assert_refused(words, host.strategy.step_post_backward, few, host.optimizers, state, 1, host.info)
+    host.state, host.pixels = state, 255 * host.pixels
+    assert_refused(r"info\['ground_truth'\] has values up to \d+.*: expected 0 .. 1", host.step, 1)
 
 
 def test_values_of_the_host_in_the_state_go_from_parent_to_child():

@@ -31,8 +31,7 @@ def make_views(away: float = 0.0, masked: bool = False, sizes: bool = False) -> 
     views = [{"image": images[i], "K": cameras.Ks[i], "camtoworld": poses[i], "image_id": i} for i in range(3)]
     if sizes:
         views[1]["image"] = views[1]["image"][:17, :33]
-    if masked:
-        views[0] |= {"mask": torch.arange(WIDTH).expand(HEIGHT, WIDTH) < 20}
+    views[0] |= {"mask": torch.arange(WIDTH).expand(HEIGHT, WIDTH) < 20} if masked else {}
     return views
 
 
@@ -169,6 +168,7 @@ WRONG |= {"white": (0, torch.inf, None), "config": (None, 3)}
         ({"overrides": None}, "an override = None is not valid: it must be text of the form section.key=value"),
         *(({name: value}, f"^{name} = {value!r} is") for name, values in WRONG.items() for value in values),
         ({"overrides": ("train.exposure=true",)}, "train.exposure is TurboStep's own: .* no exposures; leave it out"),
+        ({"overrides": ["train.iterations=9"]}, "train.iterations is max_steps here; leave it out"),
         ({"overrides": " scene.factor =2"}, "scene.factor is TurboStep's own: views, .* are the host's"),
     ],
 )

@@ -81,4 +81,4 @@ def test_info_that_does_not_fit_is_refused(monkeypatch):
     words = r"of shape \(\d, 5, 5, 3\): expected \(\d, 24, 40, 3\), what gsplat"
     assert_refused(words, iteration_stats, stock(monkeypatch) | small, COUNT)
     late = {key: value for key, value in rendered_info().items() if key != "gaussian_stats"}
-    assert_refused("put them in before backward", iteration_stats, late, COUNT)
+    assert_refused("put them in before loss.backward", iteration_stats, late, COUNT)

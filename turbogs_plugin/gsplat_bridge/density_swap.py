@@ -185,9 +185,11 @@ class TurboDensityStrategy(DefaultStrategy):
         driven_by = "error" if has_errors else "gradient"
         if state["driven_by"] is None:
             print(f"TurboDensityStrategy: {_ANNOUNCEMENTS[driven_by]}.")
+            if has_errors and (most := float(info[GROUND_TRUTH].max())) > 2:
+                raise InputError(f"info['{GROUND_TRUTH}'] has values up to {most:g}: expected 0 .. 1")
             if self.absgrad and not has_errors and self.grow_grad2d != TurboDensityStrategy.grow_grad2d:
                 remedy = "set grow_absgrad2d, or go by signed gradients by absgrad=False"
-                warnings.warn(f"grow_grad2d={self.grow_grad2d:g} has no effect: {remedy}", stacklevel=3)
+                warnings.warn(f"grow_grad2d={self.grow_grad2d:g} has no effect: {remedy}", stacklevel=4)
             state.update(vars(GaussianStats.zeros(count, stats.view_counts.device)), driven_by=driven_by)
         if state["driven_by"] != driven_by:
             remedy = f"put '{PREDICTION}' and '{GROUND_TRUTH}' into info at every step, or at none"

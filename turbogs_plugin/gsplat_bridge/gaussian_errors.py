@@ -67,7 +67,7 @@ def _error_sums(info: dict[str, Any], count: int) -> Tensor | None:
     if errors is None:
         return None
     if info.get("flatten_ids") is None:
-        remedy = "put them in before backward for sparse_rasterization; gsplat's rasterization leaves 'flatten_ids'"
+        remedy = "put them in before loss.backward(), into the info of a render by gsplat's or our rasterization"
         trouble = f"info has '{PREDICTION}' and '{GROUND_TRUTH}' but neither '{STATISTICS}' nor 'flatten_ids'"
         raise InputError(f"{trouble}: {remedy}")
     ones = torch.ones_like(errors)

@@ -133,7 +133,8 @@ class TurboStep:
         require(isinstance(rates, Collection | None), "rates", rates, "names of parameters")
         self.splats, self.optimizers, self.scene = splats, {} if optimizers is None else optimizers, scene
         gaussians = self._checked()
-        device, settings = gaussians.device, host_settings(config, overrides)
+        given = OWN_SETTINGS if max_steps is None else OWN_SETTINGS | {"train.iterations": "max_steps here"}
+        device, settings = gaussians.device, host_settings(config, overrides, given)
         settings.train.sh_degree = gaussians.sh_degree
         if max_steps is not None:
             require(is_number(max_steps, whole=True) and max_steps >= 1, "max_steps", max_steps, "a whole number >= 1")
@@ -333,12 +334,12 @@ class HostRates(LearningRates):
         return replace(super().at(step), **rates)
 
 
-def host_settings(config: str, overrides: Sequence[str]) -> Config:
-    """The settings of a training in a host. Raises `InputError` for an override of one of `OWN_SETTINGS`."""
+def host_settings(config: str, overrides: Sequence[str], given: Mapping[str, str] = OWN_SETTINGS) -> Config:
+    """The settings of a training in a host. Raises `InputError` for an override of one that is `given`, and why."""
     overrides = list(overrides) if isinstance(overrides, Iterable) and not isinstance(overrides, str) else [overrides]
     for override in overrides:
         require(isinstance(override, str), "an override", override, "text of the form section.key=value")
-    refuse_overrides(overrides, OWN_SETTINGS)
+    refuse_overrides(overrides, given)
     return load_config(config, (*overrides, "train.exposure=false", "train.init=points"))
 
 
