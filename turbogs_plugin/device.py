@@ -32,7 +32,7 @@ def processor_cores() -> int:
 
 def cpu_note() -> str:
     """A line about a training on the CPU."""
-    note = "training on the CPU takes hundreds of times as long as on a GPU: --factor and --time-budget shorten it"
+    note = "training on the CPU takes hundreds of times as long as on a GPU: --factor 4 and --time-budget shorten it"
     if torch.version.cuda is None and shutil.which("nvidia-smi"):
         note += "; an NVIDIA GPU is here, and this PyTorch is built without CUDA: install one with it (pytorch.org)"
     return note
