@@ -5,7 +5,7 @@
 #
 # The captures are folders of these names. Results lie in OUT/COMMIT; what is there is not measured again, so the same
 # call goes on after a stop (Ctrl-C, or `timeout --signal INT 9m`). When all is there, it is copied into docs/lab.
-# SEEDS="0 1" has other seeds in the record than three, REPEATS=1 fewer timed commands; STUDIES="" the record alone.
+# SEEDS="0 1" has other seeds in the record than five, REPEATS=1 fewer timed commands; STUDIES="" the record alone.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 if [ -z "${TURBOGS_COMMIT:-}" ] && [ -n "$(git status --porcelain --untracked-files=no)" ]; then
@@ -35,7 +35,7 @@ walls=0
 declare -A caps=([fox]=67 [caliterra]=157 [snowmiku]=57 [bonsai]=161 [train]=203) # thousands, FastGS's numbers
 for capture in "$@"; do
     cap=cap-${caps[$(basename "$capture")]}k
-    ablate record "${SEEDS:-0 1 2}" "$capture" --only no-exposures ssim "$cap" "ssim-$cap"
+    ablate record "${SEEDS:-0 1 2 3 4}" "$capture" --only no-exposures ssim "$cap" "ssim-$cap"
 done
 structure=(density.absgrad_threshold=4.5e-4 pixel_sampler.unit=tile loss.type=sparse_ssim loss.ssim_weight=0.4)
 for capture in "$@"; do
