@@ -78,8 +78,9 @@ class Method:
 
     def columns(self) -> dict[str, list[float]]:
         """The plot's curve: errors against seconds of the whole command, whose parts but training come first."""
-        seconds = [self.mean("wall_seconds") - self.mean("seconds") + of for of in self.curve("seconds")]
-        return {"seconds": seconds, "psnr": self.curve("psnr"), "ssim": self.curve("ssim")}
+        beside = self.mean("wall_seconds") - self.mean("seconds")
+        curve = {name: self.curve(name) for name in ("seconds", "psnr", "ssim")}
+        return curve | {"seconds": [beside + seconds for seconds in curve["seconds"]]}
 
 
 METHODS = [Method(**row) for row in ROWS["record"]]
@@ -179,8 +180,7 @@ def draw(drawn: list[tuple[str, str, dict[str, list[float]]]]) -> Figure:
 
 def draw_picture() -> None:
     """Draw README's plot where the file was drawn of other data."""
-    drawn = [(of.name.partition(", at")[0], of.color, of.columns()) for of in METHODS]
-    drawn = [entry for entry in drawn if entry[1] and entry[2]["psnr"]]
+    drawn = [(of.name.partition(", at")[0], of.color, of.columns()) for of in METHODS if of.color and of.curve("psnr")]
     digest = hashlib.sha256(json.dumps(drawn).encode()).hexdigest()[:16]
     if not PICTURE.is_file() or Image.open(PICTURE).info.get("Comment") != digest:
         draw(drawn).savefig(PICTURE, dpi=90, metadata={"Comment": digest})
