@@ -33,8 +33,8 @@ def test_its_defaults_are_the_values_of_turbogs():
     section, controller = load_config("turbogs").density, vars(TurboDensityStrategy()._controller(0))
     for name in ("percent_dense", "split", "absgrad_threshold", "choose_by"):
         assert controller[name] == section[name] != vars(ErrorDrivenDensity())[name]
-    for name, digits in (("opacity_decay", 2), ("prune_score_fraction", 3)):  # 145 events in the place of 33
-        assert controller[name] == round(1 - (1 - section[name]) ** (33 / 145), digits)
+    for name, digits in (("opacity_decay", 2), ("prune_score_fraction", 3)):  # 144 events in the place of 33
+        assert controller[name] == round(1 - (1 - section[name]) ** (33 / 144), digits)
     assert (controller["final_keep"], controller["prune_world_size"]) == (1.0, 0.0)  # no end known, no size too large
     assert TurboDensityStrategy()._controller(0, "error").prune_score_fraction == 0
 

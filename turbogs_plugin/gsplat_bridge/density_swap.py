@@ -55,8 +55,9 @@ class TurboDensityStrategy(DefaultStrategy):
     ground_truth=pixels)`` stands before ``loss.backward()``, Gaussians are ranked by the error they carry (see
     `gaussian_errors`), as in the paper. The first step prints which of the two it is, and later steps must agree.
 
-    Defaults are values of `configs/turbogs.yaml`. The shares of opacity and of Gaussians that an event takes are
-    smaller than there: gsplat's 145 events together take as much as 33 events of TurboGS.
+    Threshold, split and draw are by default those of `configs/turbogs.yaml`; there is no final pruning and no bound on
+    sizes. The shares of opacity and of Gaussians that an event takes are smaller than there: gsplat's 144 events
+    together take as much as 33 events of TurboGS.
 
     Args:
         absgrad: go by absolute gradients; render with ``absgrad=True`` then. Otherwise by the signed ones.

@@ -262,16 +262,17 @@ class TurboStep:
         """The host's parameters, of a form that can be trained."""
         gaussians = host_gaussians(self.splats)
         for name, parameter in self.splats.items():
-            if parameter.dtype != torch.float32 and role_of(name, self.splats) in PARAMETER_NAMES:
+            role = role_of(name, self.splats)
+            if parameter.dtype != torch.float32 and role in PARAMETER_NAMES:
                 raise InputError(f"splats['{name}'] is of {parameter.dtype}: expected torch.float32")
             if parameter.dim() == 0 or len(parameter) != len(gaussians):
                 expected = f"{len(gaussians)} rows, one a Gaussian; keep other parameters elsewhere"
                 raise InputError(f"splats['{name}'] has shape {tuple(parameter.shape)}: expected {expected}")
             lost = int((~parameter.isfinite())[:, None].flatten(1).any(dim=1).sum())
-            if lost and role_of(name, self.splats) in PARAMETER_NAMES:
+            if lost and role in PARAMETER_NAMES:
                 remedy = "mend or remove them"
                 raise InputError(f"splats['{name}']: {lost} of {len(gaussians)} Gaussians are not finite: {remedy}")
-            if parameter.requires_grad and role_of(name, self.splats) not in {*self.optimizers, *PARAMETER_NAMES}:
+            if parameter.requires_grad and role not in {*self.optimizers, *PARAMETER_NAMES}:
                 remedy = "give optimizers, whose rows then follow"
                 raise InputError(f"splats['{name}'] is trained by an optimizer of the host: {remedy}")
         require(gaussians.shN.shape[1] in BANDS, "bands of shN", gaussians.shN.shape[1], f"among {BANDS}")
