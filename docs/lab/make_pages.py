@@ -28,7 +28,7 @@ TABLES: dict[str, Callable[[], str]] = {
     **{f"study {name}": partial(studies.study_table, name) for name in studies.STUDIES},
     "refined cameras": partial(studies.study_table, "cameras", "refined_"),
     "paper parts": paper_tables.paper_parts,
-    "ideas": paper_tables.ideas,
+    **{name: partial(paper_tables.changes, name) for name in ("ideas", "components", "tables")},
     "paper whole": paper_tables.paper_whole,
     "wall": timings.wall,
     "steps": timings.steps,

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from studies import CAPTURES, ROWS, Cells, Difference, change, duration, mean, ratio, result, study_cells, table, values
 
-DEFAULTS = ("parts", "optimizer")
+DEFAULTS = ("parts", "optimizer", "tables")
 """Studies in which each variant changes one thing of `turbogs`, on validation photos of five captures."""
 
 NOTICED = {"psnr": 0.05, "ssim": 0.001}
@@ -23,12 +23,12 @@ Pairs = dict[str, tuple[Cells, Cells]]
 
 
 def compared(studies: Sequence[str], variants: Sequence[str] | None) -> Pairs:
-    """The captures on which the first study that has both variants has them."""
+    """Each capture on which a study has both variants, in the first such study."""
+    found: Pairs = {}
     for study in studies if variants else ():
         pairs = {of: tuple(cells.get(name, []) for name in variants or ()) for of, cells in study_cells(study).items()}
-        if found := {of: pair for of, pair in pairs.items() if Difference.between(*pair, "psnr").count}:
-            return found
-    return {}
+        found = {of: pair for of, pair in pairs.items() if Difference.between(*pair, "psnr").count} | found
+    return {of: found[of] for of in sorted(found, key=[*CAPTURES, *found].index)}
 
 
 def each_capture(pairs: Pairs, timed: bool) -> str:
@@ -70,11 +70,11 @@ def paper_parts() -> str:
     return table((*head, "default"), lines)
 
 
-def ideas() -> str:
-    """Each idea of others: what it adds to `turbogs`."""
-    rows = [(*row.values(), compared(["ideas"], (row["of"], "turbogs"))) for row in ROWS["ideas"]]
-    lines = [(name, prediction, means(pairs), each_capture(pairs, False)) for name, _, prediction, pairs in rows]
-    return table(("idea, and how it was built", "prediction", "mean", "each capture"), lines)
+def changes(section: str) -> str:
+    """Rows of a section of rows.yaml: what a variant adds to another one, and what was said of it before."""
+    rows = [(row["name"], row["said"], compared([section, "tables"], row["of"])) for row in ROWS[section]["rows"]]
+    lines = [(name, said, means(pairs), each_capture(pairs, False)) for name, said, pairs in rows]
+    return table((*ROWS[section]["head"], "mean", "each capture"), lines)
 
 
 def best_psnr(cells: Cells) -> float:
