@@ -50,7 +50,9 @@ wait
 for study in ${STUDIES-paper cameras paper_parts}; do ablate "$study" "0 1 2 3 4" "${@:1:3}"; done
 if [ -n "${STUDIES-all}" ]; then
     ablate baselines 0 "${@:1:3}"
-    turbogs ablate parts scene.validation=true "${@/#/--scene=}" --gpus "$gpus" --out "$out/parts" --seeds 0
+    for study in parts components tables; do
+        turbogs ablate $study scene.validation=true "${@/#/--scene=}" --gpus "$gpus" --out "$out/$study" --seeds 0
+    done
 fi
 
 for file in "$out"/*/results.json; do

@@ -72,7 +72,7 @@ def paper_parts() -> str:
 
 def changes(section: str) -> str:
     """Rows of a section of rows.yaml: what a variant adds to another one, and what was said of it before."""
-    rows = [(row["name"], row["said"], compared([section, "tables"], row["of"])) for row in ROWS[section]["rows"]]
+    rows = [(row["name"], row["said"], compared([section, "later_ideas"], row["of"])) for row in ROWS[section]["rows"]]
     lines = [(name, said, means(pairs), each_capture(pairs, False)) for name, said, pairs in rows]
     return table((*ROWS[section]["head"], "mean", "each capture"), lines)
 
