@@ -11,17 +11,10 @@ import re
 import shlex
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from turbogs_plugin.captures.bundle_adjustment import (
-    FARTHEST_MATCH,
-    Pinholes,
-    Refinement,
-    of_these_photos,
-    refine_together,
-)
+from turbogs_plugin.captures.bundle_adjustment import FARTHEST_MATCH, Pinholes, of_these_photos, refine_together
 from turbogs_plugin.captures.capture import Capture
 from turbogs_plugin.captures.colmap import find_model, read_colmap, write_whole
 from turbogs_plugin.captures.colmap_files import ColmapModel, read_model
@@ -29,9 +22,6 @@ from turbogs_plugin.captures.mask_files import FOLDER as MASKS
 from turbogs_plugin.captures.undistort import load_pycolmap
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import require_writable
-
-if TYPE_CHECKING:
-    import pycolmap
 
 LINKED = re.compile(rf"(images|{MASKS})(_\d+)?")
 """Folders of photos, reduced photos and masks, which the new capture has links to."""
@@ -80,7 +70,7 @@ def write_refined(scene: Path, out: Path) -> str:
         try:
             for name, source in ({"images": capture.photo_folder} | linked).items():
                 (folder / name).symlink_to(source.resolve(), target_is_directory=True)
-            write_whole(_reconstruction(read_model(*found), capture, refined), folder / "sparse/0", out)
+            _write(read_model(*found), capture, refined.cameras, refined.points, folder / "sparse/0", out)
         except OSError as error:
             remedy = "make room there, or choose a disk that takes links"
             raise InputError(f"--out '{out}' cannot be written: {remedy}") from error
@@ -88,12 +78,15 @@ def write_refined(scene: Path, out: Path) -> str:
     return "\n".join([*capture.notes[1:], refined.text("cameras"), f"scene  {out}"])
 
 
-def _reconstruction(model: ColmapModel, capture: Capture, refined: Refinement) -> pycolmap.Reconstruction:
-    """The reconstruction of which a capture is, with refined cameras, and points in the order of their identifiers."""
-    pycolmap, cameras = load_pycolmap(), refined.cameras
+def _write(
+    model: ColmapModel, capture: Capture, cameras: Pinholes, points: np.ndarray, folder: Path, called: Path
+) -> None:
+    """Write the reconstruction of which a capture is, with refined cameras, and points [M, 3] in the order of their
+    identifiers. Errors as of `write_whole`, with its arguments `folder` and `called`."""
+    pycolmap = load_pycolmap()
     reconstruction, finite = pycolmap.Reconstruction(), np.isfinite(model.points["xyz"]).all(axis=1)
     numbers, colors = model.points["id"][finite], model.points["color"][finite]
-    for number, place, color in zip(numbers.tolist(), refined.points, colors, strict=True):
+    for number, place, color in zip(numbers.tolist(), points, colors, strict=True):
         reconstruction.add_point3D_with_id(number, pycolmap.Point3D(xyz=place, color=color))
     images = {image.name.replace("\\", "/"): image for image in model.images}
     for view, (name, (width, height)) in enumerate(zip(capture.names, capture.sizes.tolist(), strict=True)):
@@ -107,4 +100,4 @@ def _reconstruction(model: ColmapModel, capture: Capture, refined: Refinement) -
         for place in np.flatnonzero(np.isin(features["point"], numbers)).tolist():
             reconstruction.add_observation(features["point"][place], pycolmap.TrackElement(number, place))
     reconstruction.update_point_3d_errors()
-    return reconstruction
+    write_whole(reconstruction, folder, called)
