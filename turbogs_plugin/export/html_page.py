@@ -11,7 +11,6 @@ from html import escape
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from turbogs_plugin.engine.reference.projection import rotation_matrices
 from turbogs_plugin.engine.reference.spherical_harmonics import evaluate, unit_directions
@@ -50,21 +49,18 @@ def html_page(gaussians: Gaussians, cameras: Cameras, background: Color, title: 
         start.look_at, start.up, start.fov = MAGNIFICATION * focus, up, first.fov
         pixel = np.rint(255.0 * np.array([[background]])).astype(np.uint8)
         server.scene.set_background_image(pixel, format="png")
-        scales = MAGNIFICATION * gaussians.scales.exp().clamp(max=WIDEST)
-        axes = rotation_matrices(gaussians.quats) * scales[:, None]  # [N, 3, 3]
+        model = gaussians.map(lambda value: value.cpu().float())
+        scales = MAGNIFICATION * model.scales.exp().clamp(max=WIDEST)
+        axes = rotation_matrices(model.quats) * scales[:, None]  # [N, 3, 3]
         server.scene.add_gaussian_splats(
             "/model",
-            centers=_numpy(MAGNIFICATION * gaussians.means),
-            covariances=_numpy(axes @ axes.mT),
-            rgbs=_numpy(SH_C0 * gaussians.sh0[:, 0] + 0.5).clip(0.0, 1.0),
-            opacities=_numpy(torch.sigmoid(gaussians.opacities))[:, None],
+            centers=(MAGNIFICATION * model.means).numpy(),
+            covariances=(axes @ axes.mT).numpy(),
+            rgbs=(SH_C0 * model.sh0[:, 0] + 0.5).clamp(0.0, 1.0).numpy(),
+            opacities=torch.sigmoid(model.opacities)[:, None].numpy(),
         )
         page = server.scene.as_html(dark_mode=max(background) < 0.5)
     style = "position:fixed;z-index:9;left:0;right:0;margin:.5em;font:13px sans-serif;color:#888;pointer-events:none"
     head = f'<div style="{style}"><b>{escape(title)}</b> {escape(caption)}</div>'
     page = page.replace("<title>Viser</title>", f"<title>{escape(title)}</title>", 1)
     return page.replace("<body>", f"<body>{head}", 1)
-
-
-def _numpy(values: Tensor) -> np.ndarray:
-    return values.detach().cpu().float().numpy()
