@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import sys
 import tempfile
-from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -70,7 +69,7 @@ def render_run(
     return folders
 
 
-def distinct_stems(names: Sequence[str]) -> list[str]:
+def distinct_stems(names: tuple[str, ...]) -> list[str]:
     """Names of photos without folders and suffixes; a name that came before gets a number."""
     stems: dict[str, None] = {}
     for name in names:

@@ -45,11 +45,10 @@ def save_glb(gaussians: Gaussians, path: Path, frame: Frame, step: int = 0, anti
         f"{GLTF}:ROTATION": normalize(model.quats, dim=1)[:, [1, 2, 3, 0]],
         f"{GLTF}:SCALE": model.scales.exp(),
         f"{GLTF}:OPACITY": opacities,
-        f"{GLTF}:SH_DEGREE_0_COEF_0": model.sh0[:, 0],
     }
-    for band in range(model.shN.shape[1]):
-        degree = math.isqrt(band + 1)
-        columns[f"{GLTF}:SH_DEGREE_{degree}_COEF_{band + 1 - degree**2}"] = model.shN[:, band]
+    for band, column in enumerate(torch.cat([model.sh0, model.shN], dim=1).unbind(dim=1)):
+        degree = math.isqrt(band)
+        columns[f"{GLTF}:SH_DEGREE_{degree}_COEF_{band - degree**2}"] = column
     parts = [column.numpy().astype("<f4").tobytes() for column in columns.values()]
     starts = [0, *itertools.accumulate(map(len, parts))]
     ends = {"min": model.means.amin(dim=0).tolist(), "max": model.means.amax(dim=0).tolist()}
