@@ -61,7 +61,7 @@ STILL_LARGER = {
         2_564,
         "bundle adjustment (.18 to .5 dB); files as other programs and scripts leave them; depth maps, .exr too; scans",
     ),
-    "turbogs_plugin/export": (783, "glTF, OpenUSD and .spz 2; a local origin for UTM captures; size and rate of films"),
+    "turbogs_plugin/export": (770, "glTF, OpenUSD and .spz 2; a local origin for UTM captures; size and rate of films"),
 }
 """Folder or modules above their budget -> lines that they have, and what pays for those beyond it. They only shrink;
 within the budget, an entry goes."""
