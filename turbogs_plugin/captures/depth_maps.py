@@ -7,23 +7,21 @@ from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
-from turbogs_plugin.captures.capture import text_of
 from turbogs_plugin.captures.decoding import ALWAYS_PIXELS, PIXELS_A_BYTE, opened_image
+from turbogs_plugin.captures.transforms import BENDS, FILE, frames_of
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.depths import CELL, Maps
 from turbogs_plugin.scene.scene import PosedImages
-from turbogs_plugin.yaml_json import parse_json
 
-FILE, KEY, LENS = "transforms.json", "depth_file_path", ("k1", "k2", "k3", "k4", "p1", "p2")
+KEY = "depth_file_path"
 FEWEST, METRIC = 20, 0.1  # a map is metric where its median ratio to points' depths is so near 1, or of fewer cells
 
 
 def depth_maps(folder: Path, views: PosedImages, unit: float) -> Maps | None:
     """What gives the maps of photos without a lens; None where there is none. `unit`: the scene's, in the capture's."""
-    content = parse_json(text_of(folder / FILE), FILE) if (folder / FILE).is_file() else {}
     named: dict[str, Path] = {}
-    for frame in ({**content, **frame} for frame in content.get("frames", [])):
-        if frame.get(KEY) and not any(frame.get(name) for name in LENS):
+    for frame in frames_of(folder / FILE)[1] if (folder / FILE).is_file() else []:
+        if KEY in frame and not any(frame.get(bend) for bend in BENDS):
             parts, place = PureWindowsPath(frame["file_path"]).parts, PureWindowsPath(str(frame[KEY])).as_posix()
             named |= {"/".join(parts[first:]): folder / place for first in range(len(parts))}
 

@@ -42,12 +42,12 @@ def read_transforms(scene: Path) -> Capture:
     """Read ``scene/transforms.json``, with the split of its lists, and points of its ``ply_file_path``. Raises
     `InputError` for a file that is not such JSON, lacks something or describes no lens; a photo that two frames name;
     lists that are no split; a cloud that is absent or damaged."""
-    content, frames = _frames(source := scene / FILE)
+    content, frames = frames_of(source := scene / FILE)
     train, test = _own_split(content, {_written(frame) for frame in frames}, source)
     used = [frame for frame in frames if _written(frame) in train | test]
     words = f", {len(frames) - len(used)} others not used" if len(used) < len(frames) else ""
     if content.get(TEST_FRAMES):
-        tested = _frames(source, TEST_FRAMES)[1]
+        tested = frames_of(source, TEST_FRAMES)[1]
         used, test, words = [*used, *tested], {*test, *map(_written, tested)}, f"{words}, with {TEST_FRAMES}"
     return _capture(source, content, used, test, f"nerfstudio, instant-ngp{words}")
 
@@ -55,9 +55,9 @@ def read_transforms(scene: Path) -> Capture:
 def read_blender(scene: Path) -> Capture:
     """Read a NeRF-synthetic capture, with the split of its files; where there are no test photos, the split is left to
     the order of the photos. Raises `InputError` as `read_transforms`, and for one photo in both files."""
-    content, train = _frames(source := scene / TRAIN_FILE)
+    content, train = frames_of(source := scene / TRAIN_FILE)
     test_file = next((scene / name for name in TEST_FILES if (scene / name).is_file()), None)
-    tested, words = ([], "") if test_file is None else (_frames(test_file)[1], f", with {test_file.name}")
+    tested, words = ([], "") if test_file is None else (frames_of(test_file)[1], f", with {test_file.name}")
     test = {_written(frame) for frame in tested}
     return _capture(source, content, [*train, *tested], test, f"NeRF-synthetic{words}")
 
@@ -74,7 +74,7 @@ def read_frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list
     return content, frames
 
 
-def _frames(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[Frame]]:
+def frames_of(source: Path, key: str = "frames") -> tuple[dict[str, Any], list[Frame]]:
     """A file's content, and its frames. Intrinsics and distortion may stand in each frame or for all."""
     content, frames = read_frames(source, key)
     if not all(isinstance(frame.get("file_path"), str) for frame in frames):
