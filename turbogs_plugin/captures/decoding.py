@@ -67,19 +67,12 @@ def require_8_bits(image: Image.Image, path: Path) -> None:
         raise InputError(f"photo {path} has more than 8 bits a channel: convert it to 8-bit RGB")
 
 
-def is_transparent(image: Image.Image) -> bool:
-    """True where an image may have pixels that are not opaque, by its header."""
-    return "A" in image.getbands() or "transparency" in image.info
-
-
-def channels_of(paths: Sequence[Path]) -> int:
-    """4 where a photo may be transparent, by the headers, else 3."""
-    for path in paths:
-        if path.suffix.lower() not in OPAQUE_SUFFIXES:
-            with opened_image(path) as image:
-                if is_transparent(image):
-                    return 4
-    return 3
+def is_transparent(path: Path) -> bool:
+    """True where a photo may have pixels that are not opaque, by its header."""
+    if path.suffix.lower() in OPAQUE_SUFFIXES:
+        return False
+    with opened_image(path) as image:
+        return "A" in image.getbands() or "transparency" in image.info
 
 
 def photo_sizes(paths: Sequence[Path]) -> np.ndarray:
@@ -120,7 +113,7 @@ def load_photos(
         target, lens = tuple(targets[view].tolist()), lenses[view]
         with opened_image(paths[view]) as image:
             image.load()
-            whole = image.convert("RGBA") if channels == 4 or is_transparent(image) else image
+            whole = image.convert("RGBA") if channels == 4 or image.mode == "P" else image
             photo = whole if whole.mode == mode else whole.convert(mode)  # which copies where nothing is to be done
         if lens is not None:
             photo = lens.undistort(photo)

@@ -17,7 +17,7 @@ import torch
 from turbogs_plugin.captures import transforms
 from turbogs_plugin.captures.capture import FEWEST_PHOTOS, Capture
 from turbogs_plugin.captures.colmap import MODEL_FOLDERS, find_model, read_colmap
-from turbogs_plugin.captures.decoding import ALWAYS_PIXELS, channels_of, load_photos, photo_sizes, reduced_sizes
+from turbogs_plugin.captures.decoding import ALWAYS_PIXELS, is_transparent, load_photos, photo_sizes, reduced_sizes
 from turbogs_plugin.captures.mask_files import find_masks, load_masks
 from turbogs_plugin.captures.photo_files import IMAGES, find_photos, unread
 from turbogs_plugin.captures.starting_points import colors_in_photos, starting_points
@@ -119,7 +119,7 @@ def load_scene(
             raise InputError(f"{scene}: all {part.sum()} {name} photos are masked whole: {how}")
     views, count = np.concatenate(parts), len(parts[0])
     paths, lenses = [files[view] for view in views], [capture.lenses[view] for view in views]
-    channels = channels_of(paths) if capture.alpha == "opacity" else 3
+    channels = 4 if capture.alpha == "opacity" and any(map(is_transparent, paths)) else 3
     train, tested = (_posed(capture, frame, masks, part, sizes[part]) for part in parts)
     name, colors = scene.resolve().name, torch.from_numpy(capture.point_colors)
     loaded = Scene(name, train, tested, points, colors, frame, extent=1.0, drawn_points=drawn, doubt=capture.doubt)

@@ -15,7 +15,7 @@ from PIL import Image
 
 from turbogs_plugin.captures import photo_files
 from turbogs_plugin.captures.capture import Capture
-from turbogs_plugin.captures.decoding import OPAQUE_SUFFIXES, decoding_threads, is_transparent, opened_image
+from turbogs_plugin.captures.decoding import decoding_threads, is_transparent, opened_image
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks
 
@@ -95,10 +95,9 @@ def load_masks(
         keep, lens = np.ones(size[::-1], dtype=bool), capture.lenses[view]
         if (file := files[view]) is not None:
             keep &= _read(file, photos[view], size, tuple(full_sizes[view].tolist()))
-        if capture.alpha == "mask" and photos[view].suffix.lower() not in OPAQUE_SUFFIXES:
+        if capture.alpha == "mask" and is_transparent(photos[view]):
             with opened_image(photos[view]) as image:
-                if is_transparent(image):
-                    keep &= np.asarray(image.convert("RGBA").getchannel("A")) > 0
+                keep &= np.asarray(image.convert("RGBA").getchannel("A")) > 0
         if keep.all():
             return None
         if lens is not None:
