@@ -29,8 +29,8 @@ def require_samples(samples: PixelSamples, view_ids: Sequence[int], sizes: np.nd
     ids, weights = samples.pixel_ids, samples.weights
     if weights is not None and weights.shape != ids.shape:
         raise InputError(f"{type(sampler).__name__} returned {len(weights)} weights for {len(ids)} slots")
-    if ids.device.type == "cpu" and len(ids) and (last := int(ids.max())) >= sizes.prod(axis=1).max():  # no GPU waits
-        raise InputError(f"{type(sampler).__name__} returned pixel {last} of views of sizes {sizes.tolist()}")
+    if ids.device.type == "cpu" and (beyond := ids >= torch.from_numpy(sizes.prod(1))[samples.view_of_slot()]).any():
+        raise InputError(f"{type(sampler).__name__} returned pixel {ids[beyond][0]} beyond a view: {sizes.tolist()}")
 
 
 def require_rows(update: RowUpdate, controller: DensityController, gaussians: Gaussians) -> None:
@@ -38,11 +38,12 @@ def require_rows(update: RowUpdate, controller: DensityController, gaussians: Ga
     require_type(update, RowUpdate, controller)
     old_count, shapes = len(gaussians), {name: value.shape[1:] for name, value in gaussians.items()}
     count, kind = len(update.source), update.source.dtype
-    wrong = [f"values of {name}" for name in update.values if name not in PARAMETER_NAMES]
+    wrong = [f"values of {name}" for name in (*update.values, *update.reset) if name not in PARAMETER_NAMES]
     for name, value in update.values.items():
-        if name in shapes and value.shape != (count, *shapes[name]):
-            wrong.append(f"values of {name} of shape {tuple(value.shape)}, not {(count, *shapes[name])}")
-    wrong += [f"fresh of {len(update.fresh)} rows"] if len(update.fresh) != count else []
+        found, wanted = (value.dtype, *value.shape), (gaussians.means.dtype, count, *shapes.get(name, value.shape[1:]))
+        wrong += [f"values of {name} of {found}, not {wanted}"] if found != wanted else []
+    if update.fresh.shape != (count,) or update.fresh.dtype != torch.bool:
+        wrong.append(f"fresh of {len(update.fresh)} rows of {update.fresh.dtype}")
     if kind != torch.int64:
         wrong.append(f"source of {kind}")
     elif count:

@@ -1,6 +1,7 @@
 """Error-driven density control as a gsplat strategy."""
 
 import inspect
+import re
 from dataclasses import dataclass, field
 
 import pytest
@@ -313,10 +314,10 @@ def test_screen_gradients_are_taken_as_the_host_left_them(tells_errors):
         torch.testing.assert_close(of_many, of_one)
 
 
-@pytest.mark.parametrize("together", [False, True])
-def test_several_renders_a_step(together):
-    """As a list, or by one call after the other: the first one that is due refines."""
-    host = Host(TurboDensityStrategy(**SOON))
+@pytest.mark.parametrize(("together", "most"), [(False, 0), (True, 0), (False, 40)])
+def test_several_renders_a_step(together, most, capsys):
+    """As a list, or by one call after the other: the first one that is due refines, once, at a cap too."""
+    host = Host(TurboDensityStrategy(**SOON, max_gaussians=most, verbose=True))
     for step in range(7):
         infos = []
         for _ in range(2):
@@ -329,4 +330,5 @@ def test_several_renders_a_step(together):
             host.strategy.step_post_backward(host.splats, host.optimizers, host.state, step, given)
         if step == 0:
             assert float(host.state["view_counts"].max()) == 2 * 3  # renders times cameras
-    assert len(host.splats["means"]) > 40
+    steps = re.findall(r"Step (\d+):", capsys.readouterr().out)
+    assert len(set(steps)) == len(steps) > 0 and (len(host.splats["means"]) > 40) == (most == 0)

@@ -10,11 +10,12 @@ from helpers.bridge_host import HEIGHT, WIDTH, arguments, make_cameras, make_spl
 from helpers.gsplat_torch import gsplat_torch_render
 from helpers.refusals import assert_refused
 
+from turbogs_plugin.engine.render import dense_samples
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.gsplat_bridge import gather_pixels, sparse_loss, sparse_rasterization
 from turbogs_plugin.gsplat_bridge.gaussian_errors import iteration_stats, screen_statistics
 from turbogs_plugin.strategies.losses import CharbonnierLoss, CharbonnierNccLoss
-from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
+from turbogs_plugin.strategies.pixel_sampling import ErrorGuidedPixelSampler, RandomPixelSampler
 from turbogs_plugin.types import PARAMETER_NAMES, Gaussians, Step
 
 GSPLAT_KEYS = {
@@ -191,9 +192,21 @@ def test_sparse_loss_updates_the_maps_that_it_is_given(scene, loss):
     torch.testing.assert_close(given.view_sums, expected.view_sums)
 
 
+def test_a_splat_without_an_area_is_not_drawn():
+    """Its determinant is 0 in single precision, where nothing widens it: no gradient is NaN, as in the kernels."""
+    splats, cameras = make_splats(), make_cameras(1)
+    splats["scales"].data[:5] = -45.0
+    given = arguments(splats, cameras) | {"samples": dense_samples(cameras), "sh_degree": 1, "eps2d": 0.0}
+    colors, _, info = sparse_rasterization(**given)
+    colors.sum().backward()
+    assert not info["radii"][0, :5].any() and all(value.grad.isfinite().all() for value in splats.values())
+
+
 def test_gather_pixels(scene):
-    _, _, samples = scene
+    sampler = ErrorGuidedPixelSampler(unit="tile")  # leaves slots empty
+    samples = sampler.sample(ErrorMaps(scene[1].sizes, "cpu"), (0, 1), 0.5, Step(3, 10, 10))
     images = torch.arange(2 * HEIGHT * WIDTH * 3, dtype=torch.float32).reshape(2, HEIGHT, WIDTH, 3)
+    images[:, 0, 0] = torch.nan
     gathered = gather_pixels(images, samples).numpy()
     views, places = samples.view_of_slot().numpy(), samples.pixel_ids.numpy()
     for slot in range(0, len(samples), 7):

@@ -1,5 +1,6 @@
 """TurboStep: the host's parameters are the model, whatever the host does between two steps."""
 
+import copy
 import io
 from typing import Any
 
@@ -93,8 +94,7 @@ def test_a_resume_through_the_hosts_checkpoint_is_exact(masked):
     """With photos of two sizes, a learning rate that the host changes and a value that it replaces. What a photo has
     where its mask is False, and evaluations in between, are of no matter."""
 
-    def started(behind_the_mask: float) -> TurboStep:
-        splats = make_splats()
+    def started(behind_the_mask: float, splats: torch.nn.ParameterDict) -> TurboStep:
         optimizers = {"scales": torch.optim.Adam([splats["scales"]], lr=0.0)}
         views, options = make_views(masked=masked, sizes=True), {"rates": ("scales",), "overrides": SMALL}
         if masked:
@@ -106,8 +106,8 @@ def test_a_resume_through_the_hosts_checkpoint_is_exact(masked):
         for step in range(turbo.steps, until):
             turbo.optimizers["scales"].param_groups[0]["lr"] = 0.01 * (step >= 8)
             before = turbo.splats["scales"].detach().clone()
-            if step == 5:
-                turbo.splats["opacities"].data = torch.zeros(40)
+            if step in (5, 12):
+                turbo.splats["opacities"].data = torch.zeros_like(turbo.splats["opacities"])
             turbo.step(step)
             assert torch.equal(turbo.splats["scales"][:40], before[:40]) == (step < 8)
             assert step != 5 or turbo.splats["opacities"].abs().max() < 0.5
@@ -117,16 +117,20 @@ def test_a_resume_through_the_hosts_checkpoint_is_exact(masked):
                 torch.rand(3)
                 turbo.splats.train().requires_grad_()
 
-    whole, half = started(0.0), started(99.0)
+    whole, half = started(0.0, make_splats()), started(99.0, make_splats())
     trained(whole, STEPS, evaluated=False)
     trained(half, 12)
+    half.splats["opacities"].data = torch.zeros_like(half.splats["opacities"])
     file = io.BytesIO()
-    torch.save(half.state_dict(), file)
+    torch.save(state := half.state_dict(), file)
+    assert not state["trainer"]["gaussians"]["opacities"].any()
     file.seek(0)
     torch.manual_seed(torch.initial_seed() + 1)  # a process of its own; the state has the seed
-    resumed = started(99.0)
+    (given := copy.deepcopy(half.splats))["means"].data *= 0.1
+    resumed = started(99.0, given if masked else make_splats())
     resumed.load_state_dict(torch.load(file, weights_only=True))
     assert_is_the_model(resumed)
+    assert torch.equal(resumed.trainer.clearance.radii, whole.trainer.clearance.radii)
     trained(resumed, STEPS)
     for name in PARAMETER_NAMES:
         assert torch.equal(resumed.splats[name], whole.splats[name]), name
@@ -140,6 +144,7 @@ def with_item(**changes: Any) -> list[dict[str, Any]]:
 
 WRONG = {"max_steps": (0, 12.5, torch.inf, True, "x"), "scene_scale": (-1.0, torch.nan, True, "x"), "rates": (0,)}
 WRONG |= {"white": (0, torch.inf, None), "config": (None, 3)}
+NO_POSES = [2 * torch.eye(4), torch.diag(torch.tensor([1.0, 1, -1, 1])), torch.diag(torch.tensor([1.0, 1, 1, 2]))]
 
 
 @pytest.mark.parametrize(
@@ -148,7 +153,8 @@ WRONG |= {"white": (0, torch.inf, None), "config": (None, 3)}
         ({"views": iter(make_views())}, "views is a list_iterator: expected a data set"),
         ({"views": with_item(K=None)}, r"views\[1\] has no 'K'"),
         ({"views": with_item(image=torch.ones(HEIGHT, WIDTH, 4))}, r"views\[1\]\['image'\] is \(24, 40, 4\)"),
-        ({"views": with_item(camtoworld=2 * torch.eye(4))}, r"views\[1\]\['camtoworld'\] .* without a scale"),
+        *(({"views": with_item(camtoworld=pose)}, r"\['camtoworld'\] .* without a scale") for pose in NO_POSES),
+        ({"views": with_item(K=torch.eye(3))}, r"views\[1\]\['K'\] .* focal lengths and centre in pixels"),
         ({"views": with_item(mask=torch.ones(3, 3))}, r"views\[1\]\['mask'\] has shape \(3, 3\)"),
         ({"views": [view | {"mask": torch.zeros(HEIGHT, WIDTH)} for view in make_views()]}, "may be inverted; True is"),
         ({"views": [view | {"image": view["image"] / 255} for view in make_views()]}, "pass white=1"),

@@ -360,8 +360,10 @@ ROWS, SAME = torch.arange(3), torch.zeros(3, dtype=torch.bool)
 @pytest.mark.parametrize(
     ("update", "message"),
     [
-        (RowUpdate(ROWS, SAME, {"scale": torch.zeros(3, 3)}), "with values of scale"),
-        (RowUpdate(ROWS, SAME, {"scales": torch.zeros(4, 3)}), r"values of scales of shape \(4, 3\), not \(3, 3\)"),
+        (RowUpdate(ROWS, SAME, {}, reset=("scale",)), "with values of scale"),
+        (RowUpdate(ROWS, SAME, {"scales": torch.zeros(3, 3).half()}), r"values of scales of \(torch.float16, 3, 3\)"),
+        (RowUpdate(ROWS, ROWS, {}), r"with fresh of 3 rows of torch\.int64"),
+        (RowUpdate(ROWS, SAME, {"scales": torch.zeros(4, 3)}), r"values of scales of \(.*, 4, 3\), not \(.*, 3, 3\)"),
         (RowUpdate(ROWS, SAME[:2], {}), "with fresh of 2 rows"),
         (RowUpdate(~SAME, SAME, {}), r"with source of torch\.bool: source has old rows, as of torch\.nonzero"),
         (RowUpdate(ROWS + 1, SAME, {}), r"with source 1 \.\. 3 of 3 old rows"),

@@ -13,7 +13,7 @@ from gsplat.strategy import DefaultStrategy
 from torch import Tensor
 
 from turbogs_plugin.errors import InputError, require
-from turbogs_plugin.gsplat_bridge.gaussian_errors import WITHOUT_GRADIENT, iteration_stats, rows_of
+from turbogs_plugin.gsplat_bridge.gaussian_errors import WITHOUT_GRADIENT, iteration_stats
 from turbogs_plugin.gsplat_bridge.host import (
     GEOMETRY,
     GROUND_TRUTH,
@@ -149,15 +149,14 @@ class TurboDensityStrategy(DefaultStrategy):
         """
         require_one_process("TurboDensityStrategy")
         self._require_fields()
-        if step >= self.refine_stop_iter:
+        if step >= self.refine_stop_iter or (state or {}).get("refined") == step:
             return
         gaussians = host_gaussians(params, GEOMETRY)
         infos = [info] if isinstance(info, dict) else info
-        if state is not None and state.get("refined") == step:
-            infos = [each for each in infos if rows_of(each) in (None, len(gaussians))]
         for each in infos:
             window = self._accumulate(state, each, len(gaussians))
-        if not infos or step <= self.refine_start_iter or step % self.refine_every:
+        state["refined"] = None
+        if step <= self.refine_start_iter or step % self.refine_every:
             return
         controller = self._controller(step, state["driven_by"])
         controller.stats = window

@@ -77,11 +77,6 @@ def _error_sums(info: dict[str, Any], count: int) -> Tensor | None:
     return sums.new_zeros(count, 2).index_add(0, info["gaussian_ids"].long(), sums)
 
 
-def rows_of(info: dict[str, Any]) -> int | None:
-    """The number of Gaussians that `info` is of; None where it is packed."""
-    return None if info.get("gaussian_ids") is not None else info["means2d"].shape[-2]
-
-
 def screen_statistics(info: dict[str, Any], count: int, absgrad: bool = True) -> GaussianStats:
     """Sums of screen gradients and their squares, of views, and largest radii, in gsplat's units; the sums over pixels
     stay zero. Squares are of absolute gradients, where the pass has them and `absgrad` asks for them."""

@@ -81,7 +81,9 @@ def posed_images(views: Any, white: float) -> PosedImages:
         for key, value, side in (("K", K, 3), ("camtoworld", pose, 4)):
             good = value.shape == (side, side) and bool(value.isfinite().all())
             require(good, f"{place}['{key}']", value.tolist(), f"finite, [{side}, {side}]")
-        turned = (pose[:3, :3] @ pose[:3, :3].T - torch.eye(3)).abs().max() < 1e-3
+        require(bool((K.diagonal()[:2] > 2).all()), f"{place}['K']", K.tolist(), "focal lengths and centre in pixels")
+        axes, last = pose[:3, :3], pose[3].tolist()
+        turned = (axes @ axes.T - torch.eye(3)).abs().max() < 1e-3 and axes.det() > 0 and last == [0, 0, 0, 1]
         require(bool(turned), f"{place}['camtoworld']", pose.tolist(), "a rotation and a place, without a scale")
         cameras.append((torch.linalg.inv(pose), K))
     viewmats, Ks = (torch.stack(values).float() for values in zip(*cameras, strict=True))

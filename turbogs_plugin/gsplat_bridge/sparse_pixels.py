@@ -73,7 +73,7 @@ def gather_pixels(images: Tensor, samples: PixelSamples) -> Tensor:
         )
     flat = images.flatten(0, 2)  # [C * H * W, D]
     pixels = samples.view_of_slot() * (images.shape[1] * images.shape[2]) + samples.pixel_ids.long().clamp(min=0)
-    return flat[pixels] * samples.filled[:, None]
+    return torch.where(samples.filled[:, None], flat[pixels], 0)
 
 
 def sparse_loss(

@@ -191,13 +191,15 @@ class TurboStep:
         """Tensors and numbers for the host's checkpoint, beside its own parameters. A resume is exact on a CPU."""
         if not self._begun:
             self._begin()
+        self._take_changes()
         self._catch_up()
         self.trainer.complete()
         return self._state()
 
     def _state(self) -> dict[str, Any]:
         numbers = {"steps": self.steps, "max_steps": self.max_steps, "seed": self.trainer.config.train.seed}
-        return {**numbers, "trainer": self.trainer.state_dict()}
+        radii = self.trainer.clearance and self.trainer.clearance.radii  # by the splats at the start
+        return {**numbers, "radii": radii, "trainer": self.trainer.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from a state. `splats` gets its values; parameters that are the host's alone must be loaded before.
@@ -211,6 +213,8 @@ class TurboStep:
                 allowed = f"{count} as in the state: load them before"
                 require(followed, f"rows of splats['{name}']", len(parameter), allowed)
             self.trainer.load_state_dict(state["trainer"])
+            if self.trainer.clearance is not None:
+                self.trainer.clearance = replace(self.trainer.clearance, radii=state["radii"].to(self.trainer.device))
         except (KeyError, TypeError, IndexError, RuntimeError, ValueError) as error:
             raise InputError(f"the state does not fit this TurboStep: {error}") from None
         self.trainer.config.train.seed, self.steps, self._begun = state["seed"], state["steps"], True
