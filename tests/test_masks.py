@@ -109,6 +109,8 @@ def test_a_sampler_that_knows_no_masks_keeps_the_rest_of_its_samples():
     assert torch.equal(after.pixel_ids, before.pixel_ids[kept]) and kept.any() and not kept.all()
     assert torch.equal(after.view_of_slot(), before.view_of_slot()[kept])
     torch.testing.assert_close(after.weights / after.weights[0], before.weights[kept] / before.weights[kept][0])
+    shifted = ErrorGuidedPixelSampler(unit="tile").sample(random_maps(), (4, 3), 0.1, step(7))
+    assert maps.masks.strip(shifted).origin == shifted.origin != (0, 0)
 
 
 @pytest.mark.parametrize("unit", UNITS)

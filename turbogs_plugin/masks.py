@@ -146,4 +146,4 @@ class PixelMasks:
         weights = None if samples.weights is None else samples.weights[keep] / samples.weights[keep].mean()
         offsets = torch.nn.functional.pad(counts[left].cumsum(dim=0), (1, 0)).int()
         kept = (samples.pixel_ids[keep], samples.tile_ids[left], offsets, weights)
-        return PixelSamples(samples.view_ids, samples.sizes, *kept, has_empty_slots=False)
+        return PixelSamples(samples.view_ids, samples.sizes, *kept, has_empty_slots=False, origin=samples.origin)

@@ -147,6 +147,8 @@ def project_rows(
     # Lagrange's identity gives the determinant as a sum of squares: no cancellation, however thin the splat.
     cross = torch.linalg.cross(u, v)
     determinant = (cross * cross).sum(dim=-1) + settings.eps2d * (variance_x + variance_y + settings.eps2d)
+    wide = determinant > 0  # [R]; a splat without an area, which only an eps2d of 0 allows, is not drawn
+    determinant = torch.where(wide, determinant, 1.0)
     variance_x, variance_y = variance_x + settings.eps2d, variance_y + settings.eps2d
     conics = torch.stack([variance_y, -covariance, variance_x], dim=-1) / determinant[:, None]
 
@@ -159,7 +161,7 @@ def project_rows(
         variances = torch.stack([variance_x, variance_y], dim=-1)  # [R, 2]
         extents = (2 * torch.log(opacities / settings.alpha_min)).clamp(min=0).sqrt().clamp(max=EXTENT_MAX)
         radii = torch.ceil(extents[:, None] * variances.sqrt())
-        drawn = ((means2d + radii > 0) & (means2d - radii < image)).all(dim=-1) & (radii > 0).any(dim=-1)
+        drawn = wide & ((means2d + radii > 0) & (means2d - radii < image)).all(dim=-1) & (radii > 0).any(dim=-1)
         radii = torch.where(drawn[:, None], radii, 0).to(torch.int32)
         shares = ((cross * cross).sum(dim=-1) / determinant).sqrt()
     return Splats(means2d, conics, depths, opacities, radii, colors, shares)
