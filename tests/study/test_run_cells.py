@@ -145,8 +145,9 @@ def test_a_cell_of_other_settings_is_not_mixed_in(turbogs, small, capture, study
     """Neither is one of another capture of the same name, nor of an ablation that has its variant no more."""
     before = {path: path.read_bytes() for path in study.rglob("*") if path.is_file()}
     ablate, file, *rest = call(small, capture, study, "--only", "full")
-    code, _, err = turbogs(ablate, file, "loss.ncc_weight=0.1", *rest)
-    assert code == 2 and "other settings (loss.ncc_weight)" in err
+    for further in ((), ("--seeds", "1")):
+        code, _, err = turbogs(ablate, file, "loss.ncc_weight=0.1", *rest, *further)
+        assert code == 2 and "other settings (loss.ncc_weight)" in err
     small.write_text(SMALL.replace("full", "whole"))
     assert_one_line(turbogs(*call(small, capture, study)), "capture, full, seed 0", "put its variant back")
     assert {path: path.read_bytes() for path in study.rglob("*") if path.is_file()} == before

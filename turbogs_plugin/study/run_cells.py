@@ -37,6 +37,8 @@ from turbogs_plugin.train.inputs import open_scene, resolve_device
 
 OF_A_CALL = ("train.device", "train.batch_for")
 """Beginnings of settings that may differ between a kept cell and a later call: they change no result."""
+OF_A_CELL = ("scene.path", "train.seed")
+"""Settings that differ between cells of a variant."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,10 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
     broken: list[str] = []
     for number, (key, config) in enumerate(configs.items(), 1):
         with folder.claimed(key) as mine:
-            kept = {result.key: result for result in folder.read_study().results}
+            study = folder.read_study()
+            kept = {result.key: result for result in study.results}
+            if key in kept:
+                _require_same(study, ablation, {key: config})  # another call may have trained it meanwhile
             if not mine or key in kept:
                 continue
             scene, digest, loading = _loaded(astuple(config.scene), config.train.refine_cameras)
@@ -142,12 +147,14 @@ def _loaded(settings: tuple[Any, ...], refine: bool) -> tuple[Scene, str, float]
 
 
 def _require_same(study: Study, ablation: Ablation, configs: dict[CellKey, Config]) -> None:
-    """Raise `InputError` where a kept cell's variant is gone, or a cell that is asked for had other settings."""
+    """Raise `InputError` where a kept cell's variant is gone, or one of a variant that is asked for had other settings
+    than these, whatever its capture and seed: a page has one mean of them."""
     if gone := [str(result.key) for result in study.results if result.variant not in ablation.variants]:
         raise InputError(f"the study has the cell '{gone[0]}': put its variant back, or choose a new --out")
-    for result in (result for result in study.results if result.key in configs):
-        asked = flat_settings(configs[result.key].to_mapping())
-        changed = [path for path in changes(asked, result.settings) if not path.startswith(OF_A_CALL)]
+    asked = {key.variant: flat_settings(config.to_mapping()) for key, config in configs.items()}
+    for result in (result for result in study.results if result.variant in asked):
+        differ = changes(asked[result.variant], result.settings)
+        changed = [path for path in differ if not path.startswith((*OF_A_CALL, *OF_A_CELL))]
         if changed:
             raise InputError(f"cell '{result.key}' had other settings ({', '.join(changed[:4])}): choose a new --out")
 
