@@ -15,8 +15,7 @@ from turbogs_plugin.types import PixelSamples
 
 def require_settings(instance: Any) -> None:
     """Raise `InputError` where a setting of a strategy is of another type, or breaks the rules that hold for all: a
-    field of a `Literal` type has one of its values; a number is finite and >= 0. Call it after stricter checks.
-    """
+    field of a `Literal` type has one of its values; a number is 0 .. 1e30: fit for float32. Call it after others."""
     hints = get_type_hints(type(instance))
     for name in [field.name for field in fields(instance) if field.init]:
         value, hint = vars(instance)[name], hints[name]
@@ -24,8 +23,8 @@ def require_settings(instance: Any) -> None:
         if get_origin(hint) is Literal:
             require(value in get_args(hint), name, value, f"one of {', '.join(get_args(hint))}")
         elif hint in (int, float):
-            valid = is_number(value, whole=hint is int) and 0 <= value < math.inf
-            require(valid, name, value, f"a {'whole' if hint is int else 'finite'} number >= 0")
+            valid = is_number(value, whole=hint is int) and 0 <= value <= 1e30
+            require(valid, name, value, f"a {'whole' if hint is int else 'finite'} number >= 0, at most 1e30")
         elif classed:
             require(isinstance(value, hint), name, value, f"a {hint.__name__}")
 

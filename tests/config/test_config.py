@@ -71,6 +71,8 @@ BAD_OVERRIDES = {
     "optimizer.learning_rates.mean=1": "learning_rates.mean.*did you mean 'means'",
     "schedule.min_views=20": "20.*max_views|max_views.*20",
     "optimizer.learning_rates.means=-1": "means.*-1",
+    "optimizer.learning_rates.means=1e300": "means = 1e.300 is not valid.* at most 1e30",
+    "train.refine_until=1e30": "train.refine_until: expected a whole number",
     "train.iterations=2147483648": "iterations.*2147483648",
     "train.iterations=many": "train.iterations.*whole number.*auto.*many",
     "maps.beta=fast": "maps.beta.*number",

@@ -37,8 +37,8 @@ def test_a_run_records_the_wall_until_its_model_and_the_parts_of_its_report(capt
 
 
 def test_a_model_that_cannot_be_written_stops_the_run(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(sessions, "save_ply", lambda *_: (_ for _ in ()).throw(TrainingStopped("the disk is full")))
-    with pytest.raises(TrainingStopped, match=r"the disk is full; the last good checkpoint is '.*iteration-000010"):
+    monkeypatch.setattr(sessions, "save_ply", lambda *_: (_ for _ in ()).throw(OSError(28, "No space", "model.ply")))
+    with pytest.raises(TrainingStopped, match=r"model.ply: No space; .* make room; the last .* '.*iteration-000010"):
         run.train(tiny_config(capture), tmp_path / "run", None)
     assert not (tmp_path / "run" / "wall.json").exists()
 
@@ -51,6 +51,8 @@ def test_a_resumed_run_does_not_say_what_several_commands_took(capture, tmp_path
     assert first.signal is not None and WallRecord.read(folder.wall).wall_seconds > 0
     assert run.resume(folder.path, write_report).wall.wall_seconds is None
     assert WallRecord.read(folder.wall).wall_seconds is None and "not recorded" in folder.report.read_text()
+    whole = run.train(tiny_config(capture), tmp_path / "whole").wall
+    assert run.resume(tmp_path / "whole", write_report).wall == whole == WallRecord.read(tmp_path / "whole/wall.json")
 
 
 def test_the_report_takes_the_last_evaluation(capture, tmp_path, monkeypatch):

@@ -95,7 +95,7 @@ def convert(value: Any, hint: Any, where: str) -> Any:
             items = value.items()
             return {convert(key, str, where): convert(item, arguments[1], f"{where}.{key}") for key, item in items}
     elif hint in (float, int):
-        if number and not math.isnan(value) and (hint is float or (math.isfinite(value) and value == int(value))):
+        if number and not math.isnan(value) and (hint is float or (abs(value) < 2**63 and value == int(value))):
             return hint(value)
     elif origin is Literal:
         if value in arguments:

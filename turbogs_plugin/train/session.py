@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 from turbogs_plugin.device import free_device_memory
-from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.errors import InputError, TrainingStopped, refusal
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.scene import Scene
@@ -87,7 +87,7 @@ class RunSession(Listener):
 
     def run(self, report: Report | None, watch: Watch = ()) -> RunSession:
         """Train to the end, or until a signal; both end with a checkpoint. The model is written before it."""
-        loop, trainer, ranks = self.loop, self.trainer, self.loop.ranks
+        loop, trainer, ranks, began = self.loop, self.trainer, self.loop.ranks, self.trainer.iteration
         self.clock.mark("initial model")
         try:
             with interruptible(self._stop), closing(TrainingProgress()) as progress:
@@ -107,12 +107,17 @@ class RunSession(Listener):
             self.signal = None if loop.finished else ranks.stop_signal or self.signal
             if not ranks.first:
                 return self
-            self.wall = WallRecord(loop.clock.seconds, seconds, self.clock.parts)
-            if loop.finished and report is not None:
-                report(self)
-            write_text_atomically(self.folder.wall, json.dumps(asdict(self.wall), indent=1) + "\n")
+            earlier = WallRecord.read(self.folder.wall) if self.resumed and began == trainer.iteration else None
+            self.wall = earlier or WallRecord(loop.clock.seconds, seconds, self.clock.parts)
+            try:
+                if loop.finished and report is not None:
+                    report(self)
+            finally:
+                write_text_atomically(self.folder.wall, json.dumps(asdict(self.wall), indent=1) + "\n")
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
+        except OSError as error:
+            raise TrainingStopped(f"{error.filename or 'the disk'}: {refusal(error)}; {self._last_good()}") from error
         except torch.cuda.OutOfMemoryError as error:
             said = f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)}"
             remedy = f"try --max-gaussians {round(0.7 * len(trainer.gaussians))}"
@@ -204,8 +209,7 @@ class TrainingProgress(Listener):
     def __init__(self) -> None:
         self._terminal = sys.stderr.isatty()
         self._began: tuple[int, float] | None = None  # the iteration and time of the first look
-        self._next_refresh = 0.0
-        self._before = 0.0  # seconds of training before the first iteration
+        self._next_refresh, self._before = 0.0, 0.0  # a time; seconds of training before the first iteration
 
     def advanced(self, loop: TrainingLoop) -> None:
         now, trainer = time.perf_counter(), loop.trainer
