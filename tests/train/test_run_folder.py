@@ -93,12 +93,17 @@ def test_a_run_that_ends_before_its_first_checkpoint_does_not_claim_its_folder(c
     assert_refused("is not empty: choose a new folder", run.train, config, folder.path)
 
 
-@pytest.mark.parametrize("error", [InputError("bad"), IndexError("bad")])
-def test_an_overwritten_run_comes_back_where_the_new_one_fails(capture, tmp_path, monkeypatch, error):
-    """And goes where the new one is finished, be it after a stop. Nothing but a run is overwritten."""
+@pytest.mark.parametrize(("error", "killed"), [(InputError("bad"), False), (IndexError("bad"), True)])
+def test_an_overwritten_run_comes_back_where_the_new_one_fails(capture, tmp_path, monkeypatch, error, killed):
+    """And goes where the new one is finished, be it after a stop. Nothing but a run is overwritten. A call that was
+    killed has left the older run aside: only --overwrite goes on from there."""
     folder, config = RunFolder(tmp_path / "run"), tiny_config(capture, "train.iterations=2", "train.evaluate_at=[]")
     run.train(config, folder.path)
     before = {path.name: path.stat().st_ino for path in folder.path.iterdir()}
+    if killed:
+        (folder.path / ".replaced").touch()
+        folder.path.rename(folder.aside)
+        assert_refused(str(folder.aside), run.train, config, folder.path)
     with monkeypatch.context() as patch, pytest.raises(type(error), match="bad"):
         patch.setattr(Trainer, "step", lambda trainer: (_ for _ in ()).throw(error))
         run.train(config, folder.path, overwrite=True)

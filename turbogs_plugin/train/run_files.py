@@ -34,7 +34,8 @@ class RunFolder:
     def require_new(self, overwrite: bool = False) -> None:
         """Raise `InputError` if the folder cannot be made, or holds more than a run without a checkpoint leaves; or, to
         `overwrite`, more than a run and its exports."""
-        if self.path.exists() and not (self.path.is_dir() and self._unclaimed()):
+        claimed = self.path.exists() and not (self.path.is_dir() and self._unclaimed())
+        if claimed:
             if not overwrite or not self.asked.is_file() or self.path.is_symlink():
                 remedy = "choose a new folder; --resume goes on with a run, --overwrite replaces one"
                 raise InputError(f"--out '{self.path}' is not empty: {remedy}")
@@ -42,8 +43,9 @@ class RunFolder:
             ours |= {*map(self.path.joinpath, ("report", "export.ply", self._mark)), *self.path.glob("model.*")}
             if others := {*self.path.iterdir()} - ours:
                 raise InputError(f"--overwrite: '{min(others)}' is of no training: take it out of the folder first")
-            if self.aside.exists():
-                raise InputError(f"--overwrite: '{self.aside}' is there, an older run: move it or remove it")
+        if self.aside.exists() if claimed else self.older() and not overwrite:
+            raise InputError(f"'{self.aside}' is there, an older run: move it or remove it")
+        if claimed:
             require_writable(self.aside, f"--overwrite: '{self.aside}'")
         require_writable(self.path, f"--out '{self.path}'")
 
@@ -64,18 +66,16 @@ class RunFolder:
     def replaced(self) -> Iterator[None]:
         """Put the run that the folder holds into `aside`, until the new one is finished (`owned`). At the end it comes
         back where the new one has no checkpoint. Raises `InputError` where another process writes to it."""
-        if not self.path.exists() or self._unclaimed():
-            yield
-            return
-        with self.owned():
-            self.owner.unlink()
-            (self.path / self._mark).touch()
-            self.path.rename(self.aside)
-        print(f"turbogs: the older run lies in '{self.aside}' until this one is finished", file=sys.stderr)
+        if self.path.exists() and not self._unclaimed():
+            with self.owned():
+                self.owner.unlink()
+                (self.path / self._mark).touch()
+                self.path.rename(self.aside)
+            print(f"turbogs: the older run lies in '{self.aside}' until this one is finished", file=sys.stderr)
         try:
             yield
         finally:
-            if not self.path.exists() or self._unclaimed():
+            if self.older() and (not self.path.exists() or self._unclaimed()):
                 shutil.rmtree(self.path, ignore_errors=True)
                 (self.aside / self._mark).unlink(missing_ok=True)
                 self.aside.rename(self.path)
