@@ -193,13 +193,17 @@ def test_sparse_loss_updates_the_maps_that_it_is_given(scene, loss):
 
 
 def test_a_splat_without_an_area_is_not_drawn():
-    """Its determinant is 0 in single precision, where nothing widens it: no gradient is NaN, as in the kernels."""
+    """Its determinant is 0 in single precision, where nothing widens it: no gradient is NaN, as in the kernels. A
+    host's autocast changes nothing."""
     splats, cameras = make_splats(), make_cameras(1)
     splats["scales"].data[:5] = -45.0
-    given = arguments(splats, cameras) | {"samples": dense_samples(cameras), "sh_degree": 1, "eps2d": 0.0}
-    colors, _, info = sparse_rasterization(**given)
-    colors.sum().backward()
-    assert not info["radii"][0, :5].any() and all(value.grad.isfinite().all() for value in splats.values())
+    options, found = {"samples": dense_samples(cameras), "sh_degree": 1, "eps2d": 0.0}, []
+    for cast in (False, True):
+        with torch.autocast("cpu", enabled=cast):
+            colors, _, info = sparse_rasterization(**arguments(splats, cameras), **options)
+            found.append([colors, *torch.autograd.grad(colors.square().sum(), list(splats.values()))])
+    assert not info["radii"][0, :5].any() and all(value.isfinite().all() for value in found[0])
+    assert all(torch.equal(*pair) for pair in zip(*found, strict=True))
 
 
 def test_gather_pixels(scene):

@@ -52,7 +52,8 @@ class ReferenceScreenGradients(ScreenGradients):
         columns = (ScreenRecord.MEAN, ScreenRecord.CONIC, ScreenRecord.COLOR, ScreenRecord.OPACITY, ScreenRecord.DEPTH)
         upstream = [records[:, column] for column in columns]
         leaves = [value for _, value in self.leaves.items()]
-        gradients = torch.autograd.grad(outputs, leaves, upstream, allow_unused=True, materialize_grads=True)
+        with torch.autocast("cpu", enabled=False):
+            gradients = torch.autograd.grad(outputs, leaves, upstream, allow_unused=True, materialize_grads=True)
         place = self.rows.scatter if rows else self._sum_over_views
         named = {
             name: value if name == "shN" else place(value)
@@ -118,11 +119,12 @@ class ReferenceRendered(Rendered):
         divided = given["depth_gradients"] / alphas
         through_alpha = torch.where(self._sums[:, 3] >= ALPHA_TINY, divided * self._sums[:, 4] / alphas, 0.0)
         to_alpha = given["alpha_gradients"] - through_alpha
-        if self._background is not None:
-            to_alpha = to_alpha - given["color_gradients"].to(self._background) @ self._background
-        columns = [given["color_gradients"], to_alpha[:, None], divided[:, None]]
-        gradients = torch.cat(columns, dim=1).to(self._sums.dtype)
-        records = self._compositor.backward(self._sums, gradients, given["pixel_errors"])
+        with torch.autocast("cpu", enabled=False):
+            if self._background is not None:
+                to_alpha = to_alpha - given["color_gradients"].to(self._background) @ self._background
+            columns = [given["color_gradients"], to_alpha[:, None], divided[:, None]]
+            gradients = torch.cat(columns, dim=1).to(self._sums.dtype)
+            records = self._compositor.backward(self._sums, gradients, given["pixel_errors"])
         return ReferenceScreenGradients(self._rows, self._splats, self._leaves, records, self._compositor.samples)
 
 
@@ -132,7 +134,8 @@ def rasterize_reference(
     """`Engine.render`; float32 or float64, CPU or CUDA."""
     settings = options.settings
     stay = kept(options.dropout, len(gaussians), gaussians.device)
-    rows, leaves, splats = _projected(gaussians, cameras, options, None if stay is None else stay[:, None])
+    with torch.autocast("cpu", enabled=False):  # a host's changes no product, as it changes none in the kernels
+        rows, leaves, splats = _projected(gaussians, cameras, options, None if stay is None else stay[:, None])
     with torch.no_grad():
         table = splat_table(splats)
         compositor = Compositor(intersect_tiles(rows, splats, samples, settings), samples, settings, table)
