@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import assert_identical
+from helpers.refusals import assert_refused
 from helpers.sampling_cases import step
 
 from turbogs_plugin.error_maps import AGE_MAX, ErrorMaps
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.pixel_sampling import RandomPixelSampler
 from turbogs_plugin.tiles import dense_pixels
 from turbogs_plugin.types import PixelSamples
@@ -145,8 +145,7 @@ def test_errors_come_without_their_graph():
 def test_errors_of_another_shape_change_nothing(shape):
     maps = ErrorMaps.from_images(torch.rand(1, 16, 16))
     before = maps.state_dict()
-    with pytest.raises(InputError, match=r"expected \(2,\)"):
-        maps.update(one_tile([3, 200]), torch.ones(shape), step(AGE_MAX + 5))
+    assert_refused(r"expected \(2,\)", maps.update, one_tile([3, 200]), torch.ones(shape), step(AGE_MAX + 5))
     after = maps.state_dict()
     assert all(torch.equal(before[name], after[name]) for name in ("errors", "stamps", "view_sums"))
     assert after["stamp_base"] == before["stamp_base"]
@@ -154,10 +153,7 @@ def test_errors_of_another_shape_change_nothing(shape):
 
 def test_wrong_shape_and_options_are_named():
     for images in (torch.rand(2, 16, 16, 3), np.zeros((2, 16, 16)), [], torch.full((2, 16, 16), torch.nan)):
-        with pytest.raises(InputError, match=r"a finite tensor .H, W. for each view"):
-            ErrorMaps.from_images(images)
-    with pytest.raises(InputError, match=r"view 1 have shape \(7,\), expected \(200,\)"):
-        ErrorMaps(SIZES).initialise(1, torch.zeros(7))
+        assert_refused(r"a finite tensor .H, W. for each view", ErrorMaps.from_images, images)
+    assert_refused(r"view 1 have shape \(7,\), expected \(200,\)", ErrorMaps(SIZES).initialise, 1, torch.zeros(7))
     for option, value in {"beta": 0.0, "refresh": 0}.items():
-        with pytest.raises(InputError, match=option):
-            ErrorMaps(SIZES, **{option: value})
+        assert_refused(option, ErrorMaps, SIZES, **{option: value})

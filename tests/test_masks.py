@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from helpers.refusals import assert_refused
 from helpers.sampling_cases import SIZES, UNITS, Foreign, pixels_by_tile, random_maps, step
 
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.masks import PixelMasks
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 from turbogs_plugin.tiles import pixel_table
@@ -155,5 +155,4 @@ def test_masked_pixels_have_no_part_in_means():
     ],
 )
 def test_masks_of_other_views_are_refused(masks, named):
-    with pytest.raises(InputError, match=named):
-        ErrorMaps.from_images(torch.ones(2, 4, 4), masks=masks)
+    assert_refused(named, ErrorMaps.from_images, torch.ones(2, 4, 4), masks=masks)

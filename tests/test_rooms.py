@@ -48,7 +48,7 @@ BUDGETS = {
     "turbogs_plugin/{commands,cli,doctor,__main__}": 850,
     "strategies": 2_000,
     "csrc": 6_000,
-    "tests": 24_040,
+    "tests": 24_000,
     "docs": 960,
 }
 """Folder or modules -> the most lines of Python, and of CUDA in csrc.

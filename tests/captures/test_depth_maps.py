@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 import torch
+from helpers.refusals import assert_refused
 from helpers.rendering_scenes import make_cameras
 from PIL import Image
 
 from turbogs_plugin.captures.depth_maps import depth_maps
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene import Photos, PosedImages
 
 CAMERAS = make_cameras([(64, 48)] * 2)
@@ -69,8 +69,7 @@ def test_what_is_no_depth_stays_unknown(tmp_path):
     ],
 )
 def test_what_is_no_map_is_refused(tmp_path, values, frame, words):
-    with pytest.raises(InputError, match=words):
-        write(tmp_path, values, **frame)(0, CELLS)
+    assert_refused(words, write(tmp_path, values, **frame), 0, CELLS)
 
 
 @pytest.mark.parametrize(
@@ -80,8 +79,7 @@ def test_what_is_no_map_is_refused(tmp_path, values, frame, words):
 def test_an_exr_that_is_none_or_swells_is_refused(tmp_path, old, new, words):
     cells, file = write(tmp_path, DEPTHS.astype(np.float32)), tmp_path / "maps/0.exr"
     file.write_bytes(file.read_bytes().replace(old, new))
-    with pytest.raises(InputError, match=words):
-        cells(0, CELLS)
+    assert_refused(words, cells, 0, CELLS)
 
 
 def test_captures_without_maps_and_photos_with_a_lens_have_none(tmp_path):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.refusals import assert_refused
 
 from turbogs_plugin.config import components
 from turbogs_plugin.config.components import build
@@ -95,8 +96,7 @@ def test_an_entry_point_is_a_type(plug_in):
 @pytest.mark.parametrize("value", ["no_such_module:X", "third_party:Absent", "not a place"])
 def test_a_broken_entry_point_is_named(plug_in, value):
     plug_in("pixel_sampler", "few", value)
-    with pytest.raises(InputError, match=f"few.*{value}.*cannot be imported"):
-        build("pixel_sampler", {"type": "few"})
+    assert_refused(f"few.*{value}.*cannot be imported", build, "pixel_sampler", {"type": "few"})
 
 
 @pytest.mark.parametrize("source", ["import sys; sys.exit('two\\nlines')", "raise RuntimeError('two\\nlines')"])
@@ -123,8 +123,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("kind", "mapping", "words"), REFUSED)
 def test_what_does_not_fit_is_refused(kind, mapping, words):
-    with pytest.raises(InputError, match=words):
-        build(kind, mapping)
+    assert_refused(words, build, kind, mapping)
 
 
 @pytest.fixture
@@ -151,8 +150,7 @@ def test_code_of_a_run_that_is_not_installed_needs_trust(shared_run, plug_in, mo
     if by_entry_point:  # of a package in the run's own folder
         plug_in("density", "fading", "third_party:Fading")
         shared_run.config.write_text(shared_run.config.read_text().replace("third_party:Fading", "fading"))
-    with pytest.raises(InputError, match=r"config.yaml': density.type '.*third_party\.py\): .* --trust"):
-        shared_run.read_config(built=True)
+    assert_refused(r"config.yaml': density.type '.*third_party\.py\): .* --trust", shared_run.read_config, built=True)
     assert not Path("ran").exists() and not capsys.readouterr().err
     shared_run.read_config(built=True, trusted=True)
     assert Path("ran").exists() and "third_party.py" in capsys.readouterr().err

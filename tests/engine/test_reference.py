@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 from helpers.gsplat_torch import Drawn, gsplat_torch_render
+from helpers.refusals import assert_refused
 from helpers.rendering_scenes import dense_on_grid, make_cameras, make_gaussians, thin_out
 
 from turbogs_plugin.engine.layout import ScreenRecord
 from turbogs_plugin.engine.reference import compositing, projection
 from turbogs_plugin.engine.render import dense_samples, rasterize
 from turbogs_plugin.engine.render_pass import RasterSettings
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PARAMETER_NAMES, GaussianStats, PixelSamples
 
 SIZES = [(37, 29), (20, 50)]
@@ -248,8 +248,7 @@ def test_lower_degrees_use_their_bands_alone(degree):
 )
 def test_a_degree_that_the_model_lacks_or_no_engine_evaluates_is_refused(held, degree, refusal):
     gaussians, cameras = make_gaussians(3, degree=held), make_cameras([(4, 4)])
-    with pytest.raises(InputError, match=refusal):
-        rasterize(gaussians, cameras, dense_samples(cameras), sh_degree=degree)
+    assert_refused(refusal, rasterize, gaussians, cameras, dense_samples(cameras), sh_degree=degree)
 
 
 def test_negative_exponents_are_skipped():
@@ -277,8 +276,7 @@ def test_settings_are_used():
     "values", [{"eps2d": -0.1}, {"eps2d": np.inf}, {"near_plane": np.nan}, {"transmittance_min": 1.0}], ids=str
 )
 def test_settings_out_of_bounds_are_refused(values):
-    with pytest.raises(InputError, match=f"{list(values)[-1]} = "):
-        RasterSettings(**values)
+    assert_refused(f"{list(values)[-1]} = ", RasterSettings, **values)
 
 
 def test_other_cameras_and_gradients_that_are_wanted_are_refused_by_name():
@@ -294,7 +292,6 @@ def test_other_cameras_and_gradients_that_are_wanted_are_refused_by_name():
         (gaussians, make_cameras([(20, 18)] * 2), r"cameras have sizes \[\[20, 18\], .* samples \[\[20, 20\]"),
         (gaussians.map(torch.Tensor.half), cameras.select([0, 1]), "means are of torch.float16: give float32"),
     ):
-        with pytest.raises(InputError, match=words):
-            rasterize(model, wrong, samples)
+        assert_refused(words, rasterize, model, wrong, samples)
     with torch.no_grad():
         rasterize(wanted, cameras.select([0, 1]), samples)

@@ -5,13 +5,13 @@ import math
 
 import pytest
 import torch
+from helpers.refusals import assert_refused
 from helpers.rendering_scenes import make_cameras, make_gaussians
 
 from turbogs_plugin.engine.cuda import library, raster, training
 from turbogs_plugin.engine.cuda.workspace import MAX_CAPACITY, ZEROS_AT_ONCE, Workspace, _Pending
 from turbogs_plugin.engine.layout import INTERSECTIONS_MAX
 from turbogs_plugin.engine.rules import LossTerms
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.types import PixelSamples
 
 
@@ -76,8 +76,7 @@ def test_a_pass_that_can_never_fit_is_refused(workspace, wait):
     """Its count has stopped at the largest number; the repetition would be lost again, for ever."""
     workspace.learn(1000, tiles=1)
     receive(workspace, INTERSECTIONS_MAX, 1, flag=1)
-    with pytest.raises(InputError, match=r"at most .* intersections of tiles and splats: take fewer"):
-        workspace.take_lost(wait)
+    assert_refused(r"at most .* intersections of tiles and splats: take fewer", workspace.take_lost, wait)
     assert workspace.take_lost() == 1 and workspace.capacity(1000, tiles=1) is not None
 
 

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from helpers.refusals import assert_refused
 from scipy.spatial.transform import Rotation
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.export.camera_path import from_file, interpolated, orbit, resized, through_views
 from turbogs_plugin.model.placement import TRANSFORMS, TURNS
 from turbogs_plugin.model.similarity import Similarity
@@ -126,8 +126,7 @@ def test_a_file_of_something_else_is_refused(tmp_path, change):
         content = {"w": 64, "h": 48, "fl_x": 50.0, "frames": [{"transform_matrix": np.eye(4).tolist()}], **change}
         content = {name: value for name, value in content.items() if value is not None}
     (tmp_path / "a.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"a\.json"):
-        from_file(tmp_path / "a.json", scene_of(Frame(np.zeros(3), 1.0)), 3)
+    assert_refused(r"a\.json", from_file, tmp_path / "a.json", scene_of(Frame(np.zeros(3), 1.0)), 3)
 
 
 def test_another_size_keeps_what_is_seen_from_top_to_bottom():

@@ -7,6 +7,7 @@ import pytest
 import torch
 from gsplat import export_splats
 from helpers.models import random_gaussians
+from helpers.refusals import assert_refused
 
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.ply import load_ply, read_ply, save_ply
@@ -68,8 +69,7 @@ def test_gaussians_that_are_not_finite_are_not_written_and_a_failure_writes_noth
     keep = [i for i in range(40) if i not in (3, 5, 7)]
     assert torch.equal(load_ply(path).means, gaussians.means[keep])
     before = path.read_bytes()
-    with pytest.raises(InputError, match="none of its 0 Gaussians"):
-        save_ply(random_gaussians(0), path)
+    assert_refused("none of its 0 Gaussians", save_ply, random_gaussians(0), path)
     assert path.read_bytes() == before and [*tmp_path.iterdir()] == [path]
 
 
@@ -82,10 +82,8 @@ def test_load_leaves_out_rows_that_are_not_finite_and_refuses_a_model_without_an
     columns["rot_3"][:] = np.nan
     sizes = activated | {f"scale_{axis}": np.geomspace(1e-4, 2.0, 100) for axis in range(3)} | {"opacity": logits}
     for case, words in ((columns, "none of its 20 Gaussians is finite"), (activated, "logits"), (sizes, "logarithms")):
-        with pytest.raises(InputError, match=words):
-            load_ply(written(tmp_path / "a.ply", case))
-    with pytest.raises(InputError, match=r"cannot read .*absent\.ply"):
-        load_ply(tmp_path / "absent.ply")
+        assert_refused(words, load_ply, written(tmp_path / "a.ply", case))
+    assert_refused(r"cannot read .*absent\.ply", load_ply, tmp_path / "absent.ply")
 
 
 def written(path: Path, columns: dict[str, np.ndarray], comment: str = "") -> Path:
@@ -143,5 +141,4 @@ def test_a_model_of_2dgs_and_a_mesh_are_named(tmp_path, columns):
     lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {axis}" for axis in "xyz")]
     lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
     (tmp_path / "mesh.ply").write_text("\n".join([*lines, "0 0 0", "1 0 0", "0 1 0", "3 0 1 2", ""]))
-    with pytest.raises(InputError, match=r"mesh\.ply is not a 3DGS model: .*f_dc_0.* give the \.ply"):
-        load_ply(tmp_path / "mesh.ply")
+    assert_refused(r"mesh\.ply is not a 3DGS model: .*f_dc_0.* give the \.ply", load_ply, tmp_path / "mesh.ply")

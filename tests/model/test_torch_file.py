@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 from helpers.models import random_gaussians
+from helpers.refusals import assert_refused
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.ply import OWN
 from turbogs_plugin.model.similarity import Similarity, placed
 from turbogs_plugin.model.torch_file import read_gsplat, save_gsplat
@@ -31,8 +31,7 @@ def test_what_is_written_is_what_gsplat_loads(tmp_path, sh_degree):
 
 
 def test_what_cannot_be_written_is_refused(tmp_path):
-    with pytest.raises(InputError, match="none of its 0 Gaussians"):
-        save_gsplat(random_gaussians(0), tmp_path / "model.pt", OWN)
+    assert_refused("none of its 0 Gaussians", save_gsplat, random_gaussians(0), tmp_path / "model.pt", OWN)
     with pytest.raises(OSError, match="absent"):
         save_gsplat(random_gaussians(), tmp_path / "absent" / "model.pt", OWN)
     assert not list(tmp_path.iterdir())
@@ -55,5 +54,4 @@ def test_splats_that_are_no_model(changes, words):
     splats = [1] if changes is None else {**dict(random_gaussians().items()), **changes}
     if changes:
         splats = {name: value for name, value in splats.items() if value is not None}
-    with pytest.raises(InputError, match=words):
-        read_gsplat({"splats": splats}, "model.pt")
+    assert_refused(words, read_gsplat, {"splats": splats}, "model.pt")

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from helpers.refusals import assert_refused
 from helpers.sampling_cases import SIGMAS, SIZES, UNITS, pixels_by_tile, random_maps, step
 
 from turbogs_plugin.error_maps import ErrorMaps
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
 from turbogs_plugin.types import TILE_SIZE, Cameras, sample_order
 
@@ -60,8 +60,7 @@ def test_views_may_come_in_any_form(sampler, views):
 @pytest.mark.parametrize("views", [(5,), (0, -1), (), (0.5,), None, [[0, 1]], (2, 2)])
 def test_views_that_are_none_or_come_twice_are_refused(sampler, views):
     """A view's changes would be counted twice by `ErrorMaps.update`."""
-    with pytest.raises(InputError, match=r"view_ids = .* (from 0 to 4|each view once)"):
-        sampler.sample(random_maps(), views, 0.1, step(4))
+    assert_refused(r"view_ids = .* (from 0 to 4|each view once)", sampler.sample, random_maps(), views, 0.1, step(4))
 
 
 @pytest.mark.parametrize("sampler", [ErrorGuidedPixelSampler, RandomPixelSampler])
@@ -197,5 +196,4 @@ def test_every_pixel_is_revisited(unit):
 def test_invalid_rates_and_steps_are_named(sampler):
     wrong = [(rate, step(0), f"rate = {rate}") for rate in (0.0, 25, float("nan"), float("inf"))]
     for rate, at, named in [*wrong, (0.1, 7, "step = 7.*a Step")]:
-        with pytest.raises(InputError, match=named):
-            sampler.sample(random_maps(), (0,), rate, at)
+        assert_refused(named, sampler.sample, random_maps(), (0,), rate, at)

@@ -3,10 +3,10 @@
 import math
 
 import pytest
+from helpers.refusals import assert_refused
 
 from turbogs_plugin import strategies
 from turbogs_plugin.config.typed import settings_of
-from turbogs_plugin.errors import InputError
 
 REFUSED = {
     "SinusoidalSchedule": ({"min_views": 0}, {"max_views": 2}, {"pixel_budget": math.nan}, {"alpha": -1.0}),
@@ -36,8 +36,7 @@ REFUSED = {
 @pytest.mark.parametrize("strategy", REFUSED)
 def test_impossible_settings_are_refused_by_name(strategy):
     for values in REFUSED[strategy]:
-        with pytest.raises(InputError, match=next(iter(values))):
-            getattr(strategies, strategy)(**values)
+        assert_refused(next(iter(values)), getattr(strategies, strategy), **values)
 
 
 @pytest.mark.parametrize("strategy", REFUSED)
@@ -45,5 +44,4 @@ def test_settings_of_another_type_are_refused_by_name(strategy):
     """Numbers in text, as a script reads them from its arguments or from a file."""
     for name in settings_of(cls := getattr(strategies, strategy)):
         for wrong in ("3", None, [1.0]):
-            with pytest.raises(InputError, match=f"^{name} = .* must be "):
-                cls(**{name: wrong})
+            assert_refused(f"^{name} = .* must be ", cls, **{name: wrong})

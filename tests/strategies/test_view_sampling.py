@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from helpers.refusals import assert_refused
 from helpers.sampling_cases import successive
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.scene.geometry import look_at
 from turbogs_plugin.strategies.view_sampling import GeometryAwareViewSampler, RandomViewSampler, doubted
 from turbogs_plugin.types import Cameras, Step
@@ -130,8 +130,7 @@ def test_identical_cameras_are_all_drawn(extent):
     sampler = ready(GeometryAwareViewSampler(), orbit(1).select([0] * 5), extent)
     draws = [sampler.select(2, np.zeros(5), step(t)) for t in range(10)]
     assert {view for draw in draws for view in draw} == set(range(5)) and all(len(set(draw)) == 2 for draw in draws)
-    with pytest.raises(InputError, match="scene_extent"):
-        GeometryAwareViewSampler().setup(orbit(3), float("nan"))
+    assert_refused("scene_extent", GeometryAwareViewSampler().setup, orbit(3), float("nan"))
 
 
 def test_a_photo_that_the_model_does_not_explain_comes_in_one_of_five_rounds():

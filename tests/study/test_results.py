@@ -6,11 +6,11 @@ import re
 from dataclasses import replace
 
 import pytest
+from helpers.refusals import assert_refused
 from hypothesis import given
 from hypothesis import strategies as st
 
 from turbogs_plugin.config.configuration import load_config
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.report.provenance import Provenance
 from turbogs_plugin.study import results
 from turbogs_plugin.study.grid import Ablation, CellKey
@@ -79,8 +79,7 @@ def test_the_file_is_plain_and_says_once_what_cells_share(folder):
 )
 def test_a_file_that_is_wrong_is_refused_by_name(folder, changed, words):
     folder.file.write_text(json.dumps(json.loads(folder.file.read_text()) | changed))
-    with pytest.raises(InputError, match=re.escape(words)):
-        folder.read_study()
+    assert_refused(re.escape(words), folder.read_study)
 
 
 @pytest.mark.parametrize("changed", [{"scene": 7}, {"curve": dict.fromkeys(results.CURVE, "")}, {"final": {"x": 1e99}}])
@@ -88,8 +87,7 @@ def test_a_cell_of_another_value_is_refused_by_name(folder, changed):
     document = json.loads(folder.file.read_text())
     document["cells"][1] |= changed
     folder.file.write_text(json.dumps(document))
-    with pytest.raises(InputError, match="does not hold results of a study"):
-        folder.read_study()
+    assert_refused("does not hold results of a study", folder.read_study)
 
 
 VALUES = st.sampled_from([0, 1.5, True, "", "x", [], [1, 2.0]])

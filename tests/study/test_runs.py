@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 from helpers.framework_runs import TINY
+from helpers.refusals import assert_refused
 
 from turbogs_plugin.config.configuration import load_config
 from turbogs_plugin.config.scaling import with_iterations
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.study.results import StudyFolder
 from turbogs_plugin.study.runs import study_of_runs
 from turbogs_plugin.train.history import Evaluation, append_evaluation
@@ -48,20 +48,17 @@ def test_runs_are_reported_side_by_side(turbogs, capture, tmp_path):
 def test_a_run_of_the_settings_and_seed_of_another_is_refused(tmp_path):
     first, second = (a_run(tmp_path / name, 30) for name in ("x", "y"))
     for other in (second, tmp_path / "y" / ".." / "x"):
-        with pytest.raises(InputError, match=r"has the settings and the seed of '.*/x': .* another train.seed"):
-            study_of_runs([first, other])
+        assert_refused(r"has the settings and the seed of '.*/x': .* another train.seed", study_of_runs, [first, other])
 
 
 def test_a_stopped_run_is_refused(tmp_path):
     run = a_run(tmp_path / "run", 30)
     (run / "model.ply").unlink()
-    with pytest.raises(InputError, match=r"/run' is not finished .* turbogs train --resume "):
-        study_of_runs([run])
+    assert_refused(r"/run' is not finished .* turbogs train --resume ", study_of_runs, [run])
     (run / "model.ply").touch()  # as an export from its checkpoint leaves one
     longer = with_iterations(load_config("turbogs").without_plan(), 60)
     (run / "config.yaml").write_text(longer.to_yaml())
-    with pytest.raises(InputError, match="is not finished"):
-        study_of_runs([run])
+    assert_refused("is not finished", study_of_runs, [run])
 
 
 def test_captures_that_share_a_name_are_kept_apart(tmp_path):
@@ -97,5 +94,4 @@ def test_runs_that_were_asked_the_same_are_seeds_whatever_plan_and_budgets_made_
     }  # fmt: skip
     assert study.ablation.variants["longer"] == ["budget.time=30s"]
     (tmp_path / "a" / "asked.yaml").unlink()
-    with pytest.raises(InputError, match=r"asked\.yaml"):
-        study_of_runs(runs)
+    assert_refused(r"asked\.yaml", study_of_runs, runs)

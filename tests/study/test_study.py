@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from helpers.refusals import assert_refused
 
 from turbogs_plugin.config.configuration import Config, load_config
 from turbogs_plugin.config.scaling import with_iterations
@@ -109,15 +110,13 @@ def test_the_base_of_an_ablation_is_looked_for_beside_it(tmp_path, monkeypatch):
 def test_a_bad_ablation_is_refused(tmp_path, text, word):
     path = tmp_path / "a.yaml"
     path.write_text(text)
-    with pytest.raises(InputError, match=re.escape(word)):
-        load_ablation(str(path))
+    assert_refused(re.escape(word), load_ablation, str(path))
 
 
 def test_a_variant_that_does_not_resolve_is_named():
     ablation = Ablation("x", {"good": [], "bad": ["loss.nonsense=1"], "seeded": ["train.seed =1"]})
     for name, words in (("bad", "nonsense"), ("seeded", "train.seed is given by --seeds")):
-        with pytest.raises(InputError, match=f"variant '{name}'.*{words}"):
-            variant_config(ablation, name, 0, (), None)
+        assert_refused(f"variant '{name}'.*{words}", variant_config, ablation, name, 0, (), None)
 
 
 def test_a_number_of_steps_and_a_time_budget_exclude_each_other():

@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.framework_runs import assert_identical
+from helpers.refusals import assert_refused
 
 from turbogs_plugin import files
-from turbogs_plugin.errors import InputError, TrainingStopped
+from turbogs_plugin.errors import TrainingStopped
 from turbogs_plugin.train import checkpoint
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
 
@@ -118,8 +119,7 @@ def test_what_is_no_checkpoint_is_refused_and_runs_nothing(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     write, words = REFUSED[what]
     write(tmp_path / "hostile.pt")
-    with pytest.raises(InputError, match=words):
-        load_checkpoint(tmp_path / "hostile.pt")
+    assert_refused(words, load_checkpoint, tmp_path / "hostile.pt")
     assert not (tmp_path / "exploited").exists()
 
 
@@ -128,11 +128,9 @@ def test_a_truncated_file_is_refused(tmp_path, keep):
     path = save_checkpoint(tmp_path, 1, state())
     data = path.read_bytes()
     path.write_bytes(data[: keep if isinstance(keep, int) else int(keep * len(data))])
-    with pytest.raises(InputError, match=r"cannot be used: .*; train anew with another --out"):
-        load_checkpoint(path)
+    assert_refused(r"cannot be used: .*; train anew with another --out", load_checkpoint, path)
     (tmp_path / "iteration-000000.pt").touch()
-    with pytest.raises(InputError, match=r"cannot be used: .*; remove it to go on from iteration-000000\.pt, or"):
-        load_checkpoint(path)
+    assert_refused(r"cannot be used: .*; remove it to go on from iteration-000000\.pt, or", load_checkpoint, path)
 
 
 @pytest.mark.parametrize(

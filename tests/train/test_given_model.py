@@ -12,7 +12,7 @@ import trimesh
 from gsplat import export_splats
 from helpers.framework_runs import assert_identical, tiny_config, tiny_trainer
 from helpers.models import random_gaussians
-from helpers.refusals import assert_one_line
+from helpers.refusals import assert_one_line, assert_refused
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -135,8 +135,7 @@ def test_nerfstudios_file_beside_a_model_brings_it_back(trained, model, scene, t
         loaded = load_given(save_splats(tmp_path / "a.pt", given), scene)[0]
         torch.testing.assert_close(loaded.means, trained.means, rtol=1e-3, atol=1e-3)
     (tmp_path / TRANSFORMS).write_text(json.dumps(values | {"scale": 0}))
-    with pytest.raises(InputError, match=TRANSFORMS):
-        load_given(tmp_path / "a.pt", scene)
+    assert_refused(TRANSFORMS, load_given, tmp_path / "a.pt", scene)
 
 
 def test_a_model_in_other_coordinates_is_said_not_to_fit(model, scene, tmp_path, monkeypatch):
@@ -219,8 +218,7 @@ def test_training_starts_from_a_model_where_that_had_ended_and_goes_on_without_i
 def test_a_model_that_is_larger_than_the_cap_is_refused(finished, scene):
     with pytest.raises(InputError, match=r"more than density\.max_gaussians 100 allows.*start from points"):
         tiny_trainer(scene, f"train.init={finished}", "density.max_gaussians=100")
-    with pytest.raises(InputError, match="no room beside the 3000"):
-        tiny_trainer(scene, "density.max_gaussians=3000", "train.backdrop=true")
+    assert_refused("no room beside the 3000", tiny_trainer, scene, "density.max_gaussians=3000", "train.backdrop=true")
 
 
 @pytest.mark.parametrize("words", ["eval", "view", "render", "export", "render --path views --out NEW.mp4"])
@@ -272,8 +270,7 @@ def test_a_plain_cloud_is_a_start(capture, scene, tmp_path, shift, refused):
     cloud.export(tmp_path / "lidar.ply")
     config = tiny_config(capture, f"train.init={tmp_path / 'lidar.ply'}").without_plan()
     if refused:
-        with pytest.raises(InputError, match="the cameras see no points"):
-            initial_gaussians(scene, config, config.train.init)
+        assert_refused("the cameras see no points", initial_gaussians, scene, config, config.train.init)
         config.scene.force = True
     model = initial_gaussians(scene, config, config.train.init)
     torch.testing.assert_close(model.means, torch.from_numpy(scene.frame.normalise_points(points)).float())

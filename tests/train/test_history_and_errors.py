@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from helpers.refusals import assert_refused
 from helpers.simulated_time import SimulatedTime
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.train.history import Evaluation, append_evaluation, read_history, rewind_history
 from turbogs_plugin.train.metrics import Metrics, ViewMetrics, compare, psnr
 from turbogs_plugin.train.session import REFRESH_SECONDS, TrainingProgress
@@ -39,8 +39,7 @@ def test_a_last_line_that_was_cut_is_left_out_of_a_history(tmp_path, cut):
     path.write_text(whole + cut)
     assert [kept.iteration for kept in read_history(path)] == [0]
     path.write_text(f"{cut.rstrip()}\n{whole}")
-    with pytest.raises(InputError, match=r"history\.jsonl' line 1 is not an evaluation: take that line out"):
-        read_history(path)
+    assert_refused(r"history\.jsonl' line 1 is not an evaluation: take that line out", read_history, path)
 
 
 def test_the_worst_view_is_recorded():

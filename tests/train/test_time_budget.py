@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.framework_runs import stop_after, tiny_config
+from helpers.refusals import assert_refused
 from helpers.simulated_time import SimulatedTime
 
 from turbogs_plugin.captures import load_scene
 from turbogs_plugin.config.scaling import with_iterations
 from turbogs_plugin.config.sections import TrainConfig
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.train import pace as pacing
 from turbogs_plugin.train import run, session
 from turbogs_plugin.train.checkpoint import latest_checkpoint, load_checkpoint
@@ -130,11 +130,9 @@ def test_a_capture_that_does_not_fit_is_refused(capture, stopped, tmp_path, monk
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
 
     monkeypatch.setattr(*place, full)
-    with pytest.raises(InputError, match=r"'capture' does not fit .*: use train\.pixels_place=host"):
-        run.resume(stopped)
+    assert_refused(r"'capture' does not fit .*: use train\.pixels_place=host", run.resume, stopped)
     if place[1] != "load_state_dict":
-        with pytest.raises(InputError, match=r"does not fit into the device's memory"):
-            run.train(tiny_config(capture), tmp_path / "new")
+        assert_refused(r"does not fit into the device's memory", run.train, tiny_config(capture), tmp_path / "new")
         assert not (tmp_path / "new").exists()
 
 

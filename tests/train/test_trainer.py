@@ -20,6 +20,7 @@ import torch
 from helpers.framework_runs import assert_identical, saved, stop_after, tiny_config, tiny_trainer
 from helpers.optimizers import make_gaussians
 from helpers.processes import ended, said, start_ranks
+from helpers.refusals import assert_refused
 from PIL import Image
 
 from turbogs_plugin.captures import load_scene
@@ -275,8 +276,7 @@ def test_a_capture_made_anew_since_the_run_began_is_refused(capture, whole, tmp_
     reconstruction.write_binary(tmp_path / "capture/sparse/0")
     before = latest_checkpoint(run_folder / "checkpoints").read_bytes()
     words = r"capture '.*capture' has other cameras of train images than .*run' began: .*another --out"
-    with pytest.raises(InputError, match=words):
-        run.resume(run_folder)
+    assert_refused(words, run.resume, run_folder)
     assert latest_checkpoint(run_folder / "checkpoints").read_bytes() == before
 
 
@@ -371,16 +371,14 @@ ROWS, SAME = torch.arange(3), torch.zeros(3, dtype=torch.bool)
     ],
 )
 def test_a_change_of_rows_that_does_not_fit_together_is_refused(update, message):
-    with pytest.raises(InputError, match=message):
-        require_rows(update, NoDensity(), make_gaussians(3))
+    assert_refused(message, require_rows, update, NoDensity(), make_gaussians(3))
 
 
 def test_statistics_that_do_not_follow_their_gaussians_are_named():
     density = ErrorDrivenDensity()
     density.stats = GaussianStats.zeros(3, "cpu")
     require_stats(density, 3)
-    with pytest.raises(InputError, match=r"ErrorDrivenDensity.stats has 3 rows for 4 Gaussians: in apply"):
-        require_stats(density, 4)
+    assert_refused(r"ErrorDrivenDensity.stats has 3 rows for 4 Gaussians: in apply", require_stats, density, 4)
 
 
 def test_a_folder_that_cannot_be_written_is_not_resumed(capture, tmp_path, monkeypatch):
@@ -388,8 +386,7 @@ def test_a_folder_that_cannot_be_written_is_not_resumed(capture, tmp_path, monke
     (tmp_path / "run" / "config.yaml").write_text(tiny_config(capture).without_plan().to_yaml())
     # Whoever runs this may write to any folder.
     monkeypatch.setattr(run, "require_writable", lambda path, given: require_writable(path / "config.yaml/x", given))
-    with pytest.raises(InputError, match=r"what --resume .*run writes cannot be made in .*: choose a folder"):
-        run.resume(tmp_path / "run")
+    assert_refused(r"what --resume .*run writes cannot be made in .*: choose a folder", run.resume, tmp_path / "run")
 
 
 def test_a_folder_is_read_as_the_section_scene_says(capture):
@@ -408,8 +405,7 @@ def test_fit_takes_a_mapping_and_a_callback_and_names_what_it_does_not_know(capt
     assert seen == result.history and (result.config.train.iterations, result.config.train.refine_until) == (4, 2)
     shown = r"Fit of Scene 'capture': 7 \+ 1 views of 40x24, 73 points: 73 Gaussians of SH degree 3 on cpu, .* dB .* s"
     assert re.fullmatch(shown, repr(result)) and repr(result.scene.test.cameras) == "1 cameras of 40x24"
-    with pytest.raises(InputError, match="fit: there is no 'sampler': did you mean"):
-        fit(capture, sampler=None)
+    assert_refused("fit: there is no 'sampler': did you mean", fit, capture, sampler=None)
     with pytest.raises(InputError, match=r"loss=CharbonnierLoss is a class: give an object, CharbonnierLoss\(\.\.\.\)"):
         fit(capture, loss=CharbonnierLoss)
     with pytest.raises(InputError, match="fit: object is no PixelSampler: it lacks sample"):

@@ -20,10 +20,9 @@ import pytest
 import torch
 from helpers.framework_runs import TINY, assert_identical
 from helpers.processes import comes_true, command_line, ended, said, start_ranks
-from helpers.refusals import assert_one_line
+from helpers.refusals import assert_one_line, assert_refused
 from helpers.viewer_client import ViewerClient
 
-from turbogs_plugin.errors import InputError
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.viewer.camera import ViewerCamera
 from turbogs_plugin.viewer.live import LiveViewer
@@ -100,8 +99,7 @@ def test_scripts_of_other_pages_are_turned_away(shown, state):
 
 def test_a_viser_that_serves_otherwise_is_refused(monkeypatch):
     monkeypatch.setattr("viser.ViserServer", lambda **options: None)
-    with pytest.raises(InputError, match="cannot be kept from foreign pages"):
-        Page("127.0.0.1", 0)
+    assert_refused("cannot be kept from foreign pages", Page, "127.0.0.1", 0)
 
 
 @pytest.mark.parametrize(
