@@ -54,12 +54,15 @@ def refusal(error: OSError) -> str:
     return f"{error.strerror or ' '.join(map(str, error.args))}; {remedy}"
 
 
+def refused_file(error: OSError) -> str:
+    """The file that the system refused, where it names one, with its `refusal`."""
+    place = "the system says" if error.filename is None else f"'{error.filename}'"
+    return f"{place}: {refusal(error)}"
+
+
 def error_line(error: Exception) -> str:
     """One line, without orders to a terminal, about an `InputError`, a `TrainingStopped` or an OSError."""
-    said = str(error)
-    if isinstance(error, OSError):
-        place = "the system says" if error.filename is None else f"'{error.filename}'"
-        said = f"{place}: {refusal(error)}"
+    said = refused_file(error) if isinstance(error, OSError) else str(error)
     said = "".join(letter if letter.isprintable() else "?" for letter in " ".join(said.split()))
     return f"turbogs: error: {said if len(said) <= LONGEST_LINE else f'{said[:800]} ... {said[-400:]}'}"
 

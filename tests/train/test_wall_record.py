@@ -38,7 +38,7 @@ def test_a_run_records_the_wall_until_its_model_and_the_parts_of_its_report(capt
 
 def test_a_model_that_cannot_be_written_stops_the_run(capture, tmp_path, monkeypatch):
     monkeypatch.setattr(sessions, "save_ply", lambda *_: (_ for _ in ()).throw(OSError(28, "No space", "model.ply")))
-    with pytest.raises(TrainingStopped, match=r"model.ply: No space; .* make room; the last .* '.*iteration-000010"):
+    with pytest.raises(TrainingStopped, match=r"'model.ply': No space; .* make room; the last .* '.*iteration-000010"):
         run.train(tiny_config(capture), tmp_path / "run", None)
     assert not (tmp_path / "run" / "wall.json").exists()
 

@@ -35,10 +35,8 @@ from turbogs_plugin.study.results import Study, StudyFolder, changes, flat_setti
 from turbogs_plugin.study.study_report import write_report
 from turbogs_plugin.train.inputs import open_scene, resolve_device
 
-OF_A_CALL = ("train.device", "train.batch_for")
-"""Beginnings of settings that may differ between a kept cell and a later call: they change no result."""
-OF_A_CELL = ("scene.path", "train.seed")
-"""Settings that differ between cells of a variant."""
+MAY_DIFFER = ("scene.path", "train.seed", "train.device", "train.batch_for")
+"""Beginnings of settings that may differ between cells of a variant: of the cell, and those that change no result."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +152,7 @@ def _require_same(study: Study, ablation: Ablation, configs: dict[CellKey, Confi
     asked = {key.variant: flat_settings(config.to_mapping()) for key, config in configs.items()}
     for result in (result for result in study.results if result.variant in asked):
         differ = changes(asked[result.variant], result.settings)
-        changed = [path for path in differ if not path.startswith((*OF_A_CALL, *OF_A_CELL))]
+        changed = [path for path in differ if not path.startswith(MAY_DIFFER)]
         if changed:
             raise InputError(f"cell '{result.key}' had other settings ({', '.join(changed[:4])}): choose a new --out")
 

@@ -34,8 +34,7 @@ class RunFolder:
     def require_new(self, overwrite: bool = False) -> None:
         """Raise `InputError` if the folder cannot be made, or holds more than a run without a checkpoint leaves; or, to
         `overwrite`, more than a run and its exports."""
-        claimed = self.path.exists() and not (self.path.is_dir() and self._unclaimed())
-        if claimed:
+        if self.path.exists() and not (self.path.is_dir() and self._unclaimed()):
             if not overwrite or not self.asked.is_file() or self.path.is_symlink():
                 remedy = "choose a new folder; --resume goes on with a run, --overwrite replaces one"
                 raise InputError(f"--out '{self.path}' is not empty: {remedy}")
@@ -43,10 +42,11 @@ class RunFolder:
             ours |= {*map(self.path.joinpath, ("report", "export.ply", self._mark)), *self.path.glob("model.*")}
             if others := {*self.path.iterdir()} - ours:
                 raise InputError(f"--overwrite: '{min(others)}' is of no training: take it out of the folder first")
-        if self.aside.exists() if claimed else self.older() and not overwrite:
-            raise InputError(f"'{self.aside}' is there, an older run: move it or remove it")
-        if claimed:
+            if self.aside.exists():
+                raise InputError(f"--overwrite: '{self.aside}' is there, an older run: move it or remove it")
             require_writable(self.aside, f"--overwrite: '{self.aside}'")
+        elif self.older() and not overwrite:
+            raise InputError(f"'{self.aside}' is there, an older run: move it, or go on from there by --overwrite")
         require_writable(self.path, f"--out '{self.path}'")
 
     def require_own(self) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 from turbogs_plugin.device import free_device_memory
-from turbogs_plugin.errors import InputError, TrainingStopped, refusal
+from turbogs_plugin.errors import InputError, TrainingStopped, refused_file
 from turbogs_plugin.files import write_text_atomically
 from turbogs_plugin.model.ply import save_ply
 from turbogs_plugin.scene import Scene
@@ -117,7 +117,7 @@ class RunSession(Listener):
         except TrainingStopped as stop:
             raise TrainingStopped(f"{stop}; {self._last_good()}") from stop
         except OSError as error:
-            raise TrainingStopped(f"{error.filename or 'the disk'}: {refusal(error)}; {self._last_good()}") from error
+            raise TrainingStopped(f"{refused_file(error)}; {self._last_good()}") from error
         except torch.cuda.OutOfMemoryError as error:
             said = f"iteration {trainer.iteration}: the device's memory was too small for {len(trainer.gaussians)}"
             remedy = f"try --max-gaussians {round(0.7 * len(trainer.gaussians))}"
