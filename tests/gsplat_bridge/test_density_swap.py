@@ -330,5 +330,6 @@ def test_several_renders_a_step(together, most, capsys):
             host.strategy.step_post_backward(host.splats, host.optimizers, host.state, step, given)
         if step == 0:
             assert float(host.state["view_counts"].max()) == 2 * 3  # renders times cameras
+    host.strategy.step_post_backward(host.splats, host.optimizers, host.state, 3, [])
     steps = re.findall(r"Step (\d+):", capsys.readouterr().out)
     assert len(set(steps)) == len(steps) > 0 and (len(host.splats["means"]) > 40) == (most == 0)

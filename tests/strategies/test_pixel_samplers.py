@@ -8,6 +8,7 @@ from helpers.sampling_cases import SIGMAS, SIZES, UNITS, pixels_by_tile, random_
 
 from turbogs_plugin.error_maps import ErrorMaps
 from turbogs_plugin.strategies.pixel_sampling import DensePixelSampler, ErrorGuidedPixelSampler, RandomPixelSampler
+from turbogs_plugin.strategies.returned import require_samples
 from turbogs_plugin.types import TILE_SIZE, Cameras, sample_order
 
 
@@ -197,3 +198,10 @@ def test_invalid_rates_and_steps_are_named(sampler):
     wrong = [(rate, step(0), f"rate = {rate}") for rate in (0.0, 25, float("nan"), float("inf"))]
     for rate, at, named in [*wrong, (0.1, 7, "step = 7.*a Step")]:
         assert_refused(named, sampler.sample, random_maps(), (0,), rate, at)
+
+
+def test_a_pixel_beyond_its_own_view_is_refused():
+    sizes, sampler = np.array([[8, 8], [16, 16]]), RandomPixelSampler()
+    samples = sampler.sample(ErrorMaps(sizes), (0, 1), 1.0, step(0))
+    samples.pixel_ids[3] = 100
+    assert_refused("pixel 100 beyond a view", require_samples, samples, (0, 1), sizes, sampler)

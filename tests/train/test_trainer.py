@@ -360,6 +360,7 @@ ROWS, SAME = torch.arange(3), torch.zeros(3, dtype=torch.bool)
 @pytest.mark.parametrize(
     ("update", "message"),
     [
+        (RowUpdate(ROWS, SAME, {"scale": torch.zeros(3, 3)}), "with values of scale"),
         (RowUpdate(ROWS, SAME, {}, reset=("scale",)), "with values of scale"),
         (RowUpdate(ROWS, SAME, {"scales": torch.zeros(3, 3).half()}), r"values of scales of \(torch.float16, 3, 3\)"),
         (RowUpdate(ROWS, ROWS, {}), r"with fresh of 3 rows of torch\.int64"),

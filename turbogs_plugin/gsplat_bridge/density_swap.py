@@ -155,8 +155,7 @@ class TurboDensityStrategy(DefaultStrategy):
         infos = [info] if isinstance(info, dict) else info
         for each in infos:
             window = self._accumulate(state, each, len(gaussians))
-        state["refined"] = None
-        if step <= self.refine_start_iter or step % self.refine_every:
+        if not infos or step <= self.refine_start_iter or step % self.refine_every:
             return
         controller = self._controller(step, state["driven_by"])
         controller.stats = window
@@ -181,6 +180,7 @@ class TurboDensityStrategy(DefaultStrategy):
         """Add this iteration's statistics to those in `state`; returns the latter."""
         remedy = "pass the dict of TurboDensityStrategy.initialize_state()"
         require_keys(state, ("scene_scale", "driven_by", *_STATS), "the state", remedy)
+        state["refined"] = None  # in this step
         stats, has_errors = iteration_stats(info, count, self.absgrad)
         driven_by = "error" if has_errors else "gradient"
         if state["driven_by"] is None:
