@@ -47,8 +47,9 @@ for capture in "$@"; do
     wall "ssim-cap-${cap}k" "$capture" 1 "${structure[@]}" train.dropout=auto "${capped[@]}"
 done
 wait
-for study in ${STUDIES-paper cameras paper_parts}; do ablate "$study" "0 1 2 3 4" "${@:1:3}"; done
+for study in ${STUDIES-paper cameras paper_parts}; do ablate "$study" "0 1 2 3 4" "$@"; done
 if [ -n "${STUDIES-all}" ]; then
+    ablate baselines "0 1 2" "$@" --only 3dgs
     ablate baselines 0 "${@:1:3}"
     for study in parts components tables; do
         turbogs ablate $study scene.validation=true "${@/#/--scene=}" --gpus "$gpus" --out "$out/$study" --seeds 0

@@ -7,7 +7,8 @@ import statistics
 from collections.abc import Sequence
 
 import numpy as np
-from studies import CAPTURES, ROWS, Cells, Difference, change, duration, mean, ratio, result, study_cells, table, values
+from record import CAPTURES as FIVE
+from studies import CAPTURES, ROWS, Cells, Difference, change, duration, mean, ratio, result, study_cells, table
 
 DEFAULTS = ("parts", "optimizer", "tables")
 """Studies in which each variant changes one thing of `turbogs`, on validation photos of five captures."""
@@ -31,9 +32,9 @@ def compared(studies: Sequence[str], variants: Sequence[str] | None) -> Pairs:
     return {of: found[of] for of in sorted(found, key=[*CAPTURES, *found].index)}
 
 
-def each_capture(pairs: Pairs, timed: bool) -> str:
+def each_capture(pairs: Pairs) -> str:
     """A line for each capture."""
-    return "<br>".join(f"{capture}: {change(*pair, timed=timed)}" for capture, pair in pairs.items()) or "-"
+    return "<br>".join(f"{capture}: {change(*pair, timed=False)}" for capture, pair in pairs.items()) or "-"
 
 
 def over_captures(pairs: Pairs, measure: str) -> Difference:
@@ -46,7 +47,7 @@ def over_captures(pairs: Pairs, measure: str) -> Difference:
 def means(pairs: Pairs) -> str:
     """Means over the captures, what they say, and what the change costs."""
     if not pairs:
-        return "not measured"
+        return "-"
     psnr, ssim = (over_captures(pairs, measure) for measure in NOTICED)
     times = statistics.geometric_mean(ratio(*pair, "gaussians") for pair in pairs.values())
     said: dict[str, list[str]] = {"better": [], "worse": []}
@@ -60,20 +61,22 @@ def means(pairs: Pairs) -> str:
 
 
 def paper_parts() -> str:
-    """Each part: what it adds to `turbogs` on five captures and to `turbogs-paper` on three, and the default's way."""
+    """Each part: what it adds to `turbogs` and to `turbogs-paper` on five captures, and the default's way."""
     lines = []
     for row in ROWS["paper parts"]:
         ours, papers = compared(DEFAULTS, row.get("ours")), compared(["paper_parts"], row.get("papers"))
         default = ("the paper's" if row["ours"][0] == "turbogs" else "ours") if ours else "-"
-        lines.append((row["name"], means(ours), each_capture(ours, False), each_capture(papers, True), default))
-    head = ("the paper's part", "in our default, mean", "in our default, each capture", "in the paper's configuration")
-    return table((*head, "default"), lines)
+        both = [text for pairs in (ours, papers) for text in (means(pairs), each_capture(pairs))]
+        lines.append((row["name"], *both, default))
+    ways = ("our default", "the paper's configuration")
+    head = [f"in {way}, {what}" for way in ways for what in ("mean", "each capture")]
+    return table(("the paper's part", *head, "default"), lines)
 
 
 def changes(section: str) -> str:
     """Rows of a section of rows.yaml: what a variant adds to another one, and what was said of it before."""
     rows = [(row["name"], row["said"], compared([section, "later_ideas"], row["of"])) for row in ROWS[section]["rows"]]
-    lines = [(name, said, means(pairs), each_capture(pairs, False)) for name, said, pairs in rows]
+    lines = [(name, said, means(pairs), each_capture(pairs)) for name, said, pairs in rows]
     return table((*ROWS[section]["head"], "mean", "each capture"), lines)
 
 
@@ -82,10 +85,12 @@ def best_psnr(cells: Cells) -> float:
     return statistics.fmean(max(cell["curve"]["psnr"]) for cell in cells)
 
 
-def first_at(cells: Cells, psnr: float) -> str:
-    """Seconds until a test PSNR is first passed, on the line between evaluations: mean over seeds, if all pass it."""
+def first_at(cells: Cells, psnr: float, theirs: Cells) -> str:
+    """Seconds until a test PSNR is first passed, on the line between evaluations, and the share of `theirs` whole time
+    as 1/N: means over seeds, if all pass it."""
     curves = ((np.maximum.accumulate(cell["curve"]["psnr"]), cell["curve"]["seconds"]) for cell in cells)
-    return duration(statistics.fmean(float(np.interp(psnr - 1e-9, *curve, right=math.nan)) for curve in curves))
+    seconds = statistics.fmean(float(np.interp(psnr - 1e-9, *curve, right=math.nan)) for curve in curves)
+    return "-" if math.isnan(seconds) else f"{duration(seconds)} s, 1/{mean(theirs, 'seconds') / seconds:.0f}"
 
 
 def whole_run(cells: Cells) -> str:
@@ -93,27 +98,22 @@ def whole_run(cells: Cells) -> str:
     return f"{text}; best on the way {best_psnr(cells):.2f} dB ({len(cells)})"
 
 
-def within_bound(paper: Cells, psnr: float, bound: float = 0.3) -> str:
-    """`turbogs-paper` minus 3DGS, with the standard error of its seeds, and whether it is within `bound` dB below:
-    undecided where two standard errors change that. 3DGS is one run, whose error is not known."""
-    difference, error = mean(paper, "psnr") - psnr, statistics.stdev(values(paper, "psnr")) / math.sqrt(len(paper))
-    kept = f"{'within' if difference >= -bound else 'beyond'} the bound"
-    return f"{difference:+.2f} ± {error:.2f} dB, {'undecided' if abs(difference + bound) < 2 * error else kept}"
-
-
 def paper_whole() -> str:
-    """The paper's configuration with and without its repair, beside full-length 3DGS and `turbogs`."""
+    """The paper's configurations beside full-length 3DGS and `turbogs`: ends, and seconds to 3DGS's errors."""
     entries = {
         "3DGS, 30,000 iterations": ("baselines", "3dgs"),
         "`turbogs-paper`": ("paper", "turbogs-paper"),
+        "TurboGS-Big, 8000 iterations": ("paper", "paper-big"),
         "`paper-literal`, without the repair": ("paper", "paper-literal"),
-        "`turbogs`": ("cameras", "turbogs"),
+        "`turbogs`": ("record", "turbogs"),
     }
-    found = {name: [study_cells(study)[of][variant] for of in CAPTURES] for name, (study, variant) in entries.items()}
+    found = {name: [study_cells(study)[of][variant] for of in FIVE] for name, (study, variant) in entries.items()}
     lines = [(name, *map(whole_run, cells)) for name, cells in found.items()]
     theirs, paper, *_ = found.values()
     for name, of in (("end", lambda cells: mean(cells, "psnr")), ("best on the way", best_psnr)):
         psnr = [of(cells) for cells in theirs]
-        lines.append((f"`turbogs-paper`, its end, minus 3DGS, its {name}", *map(within_bound, paper, psnr)))
-        lines += [(f"seconds to 3DGS's {name}: {row}", *map(first_at, cells, psnr)) for row, cells in found.items()]
-    return table(("", *CAPTURES), lines)
+        ahead = [f"{mean(cells, 'psnr') - base:+.2f} dB" for cells, base in zip(paper, psnr, strict=True)]
+        lines.append((f"`turbogs-paper`, its end, minus 3DGS, its {name}", *ahead))
+        times = {row: list(map(first_at, cells, psnr, theirs)) for row, cells in found.items()}
+        lines += [(f"to 3DGS's {name}: {row}", *of) for row, of in times.items() if set(of) != {"-"}]
+    return table(("", *FIVE), lines)
