@@ -79,7 +79,8 @@ def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | Non
         gpus: number of this machine's GPUs, a process each; None: this process trains.
 
     Raises:
-        InputError: anything wrong with the input (then nothing was trained), or a cell made with other settings.
+        InputError: a capture that cannot be read (the others' cells are trained first); anything else wrong with the
+            input, or a cell made with other settings (then nothing was trained).
         TrainingStopped: a process was killed.
     """
     folder = StudyFolder(out)
@@ -103,22 +104,27 @@ def run_study(ablation: Ablation, choice: CellChoice, out: Path, gpus: int | Non
 
 def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, here: Provenance) -> list[str]:
     """Train, in this process, the cells that the folder has not and no other process trains; what broke. Raises
-    `InputError` where a capture cannot be read, or is another one than the finished cells'."""
+    `InputError` last, for captures that cannot be read, or are others than the finished cells'."""
     configs = choice.configs(ablation)
     device = torch.device(next(iter(configs.values())).train.device)
     warm: set[tuple[str, str]] = set()  # variants and captures
     broken: list[str] = []
+    unread: dict[str, InputError] = {}  # by capture
     for number, (key, config) in enumerate(configs.items(), 1):
         with folder.claimed(key) as mine:
             study = folder.read_study()
             kept = {result.key: result for result in study.results}
             if key in kept:
                 _require_same(study, ablation, {key: config})  # another call may have trained it meanwhile
-            if not mine or key in kept:
+            if not mine or key in kept or key.scene in unread:
                 continue
-            scene, digest, loading = _loaded(astuple(config.scene), config.train.refine_cameras)
-            if any(cell.scene == key.scene and cell.capture not in ("", digest) for cell in kept.values()):
-                raise InputError(f"'{key.scene}' has other photos than its kept cells: choose a new --out")
+            try:
+                scene, digest, loading = _loaded(astuple(config.scene), config.train.refine_cameras)
+                if any(cell.scene == key.scene and cell.capture not in ("", digest) for cell in kept.values()):
+                    raise InputError(f"'{key.scene}' has other photos than its kept cells: choose a new --out")
+            except InputError as error:
+                unread[key.scene] = error
+                continue
             try:
                 free_device_memory(device)  # memory of a cell that broke
                 is_warm = (key.variant, key.scene) in warm
@@ -133,6 +139,8 @@ def train_cells(ablation: Ablation, choice: CellChoice, folder: StudyFolder, her
                 said = f"{key}: {psnr:.2f} dB in {end['seconds']:.1f} s, {end['gaussians']} Gaussians"
             # One write with the end of the line, or the lines of two processes would stand on one.
             print(f"[{number}/{len(configs)}] {said}\n", end="", file=sys.stderr, flush=True)
+    if unread:
+        raise InputError("; ".join(map(str, unread.values())))
     return broken
 
 
