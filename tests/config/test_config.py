@@ -16,7 +16,7 @@ from turbogs_plugin.config.configuration import (
     resolve_complete,
     settings_text,
 )
-from turbogs_plugin.config.sections import parse_bytes, parse_seconds
+from turbogs_plugin.config.sections import BudgetConfig, parse_bytes, parse_seconds
 from turbogs_plugin.config.typed import settings_of
 from turbogs_plugin.errors import InputError
 from turbogs_plugin.files import read_text
@@ -175,6 +175,7 @@ def test_amounts():
     assert {text: parse_bytes(text) for text in memory} == memory
     times = {"20s": 20, "2m": 120, "1.5 h": 5400, "0.5": 0.5, "3min": 180}
     assert {text: parse_seconds(text) for text in times} == times
+    assert load_config("turbogs", ["budget.time=20", "budget.max_memory=4096"]).budget == BudgetConfig("4096", "20.0")
 
 
 @pytest.mark.parametrize("text", ["", "GiB", "-2GiB", "2 apples", "0", "1e9", "2GiB 3", "inf", "nan", "9" * 400])

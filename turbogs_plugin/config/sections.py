@@ -187,24 +187,25 @@ class BudgetConfig:
     """What the run may take besides Gaussians, whose cap is the density control's `max_gaussians`.
 
     Args:
-        max_memory: most memory of the device, for instance 2GiB; empty: no limit.
-        time: seconds of training to end after, for instance 20s or 2m; empty: `train.iterations` decide.
+        max_memory: most memory of the device, for instance 2GiB, or bytes; empty: no limit.
+        time: of training to end after, for instance 20s or 2m, or seconds; empty: `train.iterations` decide.
     """
 
-    max_memory: str = ""
-    time: str = ""
+    max_memory: str | int = ""
+    time: str | float = ""
 
     def __post_init__(self) -> None:
+        self.max_memory, self.time = str(self.max_memory), str(self.time)
         self.memory_bytes()  # which raises `InputError` where it is no amount
         require((self.seconds() or 0.0) <= LONGEST_TIME, "time", self.time, "at most 100h")
 
     def memory_bytes(self) -> int | None:
         """`max_memory`, or None for no limit."""
-        return parse_bytes(self.max_memory) if self.max_memory else None
+        return parse_bytes(str(self.max_memory)) if self.max_memory else None
 
     def seconds(self) -> float | None:
         """`time`, or None for no limit."""
-        return parse_seconds(self.time) if self.time else None
+        return parse_seconds(str(self.time)) if self.time else None
 
 
 def undecided(mapping: Mapping[str, Mapping[str, Any]]) -> list[str]:
