@@ -286,6 +286,7 @@ def test_a_run_without_a_report_tells_its_model_and_both_clocks(turbogs, capture
     [
         ("trian x --out y", "no such command 'trian': did you mean 'train'? (known: ablate, bench, "),
         ("train s --out r --fctor 3", "turbogs train: there is no --fctor: did you mean '--factor'?"),
+        ("train --scene s --out r", "turbogs train: there is no --scene: write the SCENE without --scene; see"),
         ("train s --out r --iterations 5", "turbogs train: there is no --iterations: write train.iterations=5; see"),
         ("train s --out r --train.seed=5", "turbogs train: there is no --train.seed: write train.seed=5; see"),
         ("train s --out r --pixel-sampler dense", "there is no --pixel-sampler: write pixel_sampler.type=dense; see"),

@@ -98,6 +98,8 @@ def _unknown_option(function: Command, words: Sequence[str]) -> str:
         if not option.startswith("--") or name in known:
             continue
         remedy = nearest(option, (f"--{entry.replace('_', '-')}" for entry in known))
+        if name in signature(function).parameters:  # and not known: positional
+            return f"there is no {option}: write the {name.upper()} without {option}"
         if "overrides" in signature(function).parameters:
             from turbogs_plugin.config.configuration import settings_named
 
