@@ -7,7 +7,6 @@ import statistics
 from collections.abc import Sequence
 
 import numpy as np
-from record import CAPTURES as FIVE
 from studies import CAPTURES, ROWS, Cells, Difference, change, duration, mean, ratio, result, study_cells, table
 
 DEFAULTS = ("parts", "optimizer", "tables")
@@ -86,16 +85,16 @@ def best_psnr(cells: Cells) -> float:
 
 
 def first_at(cells: Cells, psnr: float, theirs: Cells) -> str:
-    """Seconds until a test PSNR is first passed, on the line between evaluations, and the share of `theirs` whole time
-    as 1/N: means over seeds, if all pass it."""
+    """Seconds until a test PSNR is first passed, on the line between evaluations, and as 1/N of `theirs`: mean over
+    seeds, if all pass it."""
     curves = ((np.maximum.accumulate(cell["curve"]["psnr"]), cell["curve"]["seconds"]) for cell in cells)
     seconds = statistics.fmean(float(np.interp(psnr - 1e-9, *curve, right=math.nan)) for curve in curves)
     return "-" if math.isnan(seconds) else f"{duration(seconds)} s, 1/{mean(theirs, 'seconds') / seconds:.0f}"
 
 
-def whole_run(cells: Cells) -> str:
-    text = result(cells, f"{mean(cells, 'psnr'):.2f}")
-    return f"{text}; best on the way {best_psnr(cells):.2f} dB ({len(cells)})"
+def whole_run(cells: Cells, theirs: Cells) -> str:
+    text = f"x {ratio(cells, theirs, 'seconds'):.2f} s; best on the way {best_psnr(cells):.2f} dB ({len(cells)})"
+    return f"{result(cells, format(mean(cells, 'psnr'), '.2f'))}; {text}"
 
 
 def paper_whole() -> str:
@@ -107,13 +106,14 @@ def paper_whole() -> str:
         "`paper-literal`, without the repair": ("paper", "paper-literal"),
         "`turbogs`": ("record", "turbogs"),
     }
-    found = {name: [study_cells(study)[of][variant] for of in FIVE] for name, (study, variant) in entries.items()}
-    lines = [(name, *map(whole_run, cells)) for name, cells in found.items()]
+    captures = study_cells("paper")
+    found = {name: [study_cells(study)[of][variant] for of in captures] for name, (study, variant) in entries.items()}
     theirs, paper, *_ = found.values()
+    lines = [(name, *map(whole_run, cells, theirs)) for name, cells in found.items()]
     for name, of in (("end", lambda cells: mean(cells, "psnr")), ("best on the way", best_psnr)):
         psnr = [of(cells) for cells in theirs]
         ahead = [f"{mean(cells, 'psnr') - base:+.2f} dB" for cells, base in zip(paper, psnr, strict=True)]
         lines.append((f"`turbogs-paper`, its end, minus 3DGS, its {name}", *ahead))
-        times = {row: list(map(first_at, cells, psnr, theirs)) for row, cells in found.items()}
-        lines += [(f"to 3DGS's {name}: {row}", *of) for row, of in times.items() if set(of) != {"-"}]
-    return table(("", *FIVE), lines)
+        reached = [(f"to 3DGS's {name}: {row}", *map(first_at, cells, psnr, theirs)) for row, cells in found.items()]
+        lines += [line for line in reached if set(line[1:]) != {"-"}]
+    return table(("", *captures), lines)

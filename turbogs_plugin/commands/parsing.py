@@ -99,8 +99,8 @@ def _unknown_option(function: Command, words: Sequence[str]) -> str:
             continue
         remedy = nearest(option, (f"--{entry.replace('_', '-')}" for entry in known))
         if name in signature(function).parameters:  # and not known: positional
-            return f"there is no {option}: write the {name.upper()} without {option}"
-        if "overrides" in signature(function).parameters:
+            remedy = f"write the {name.upper()} without {option}"
+        elif "overrides" in signature(function).parameters:
             from turbogs_plugin.config.configuration import settings_named
 
             said = value if equals else "" if behind.startswith("--") else behind

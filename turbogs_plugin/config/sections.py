@@ -187,8 +187,8 @@ class BudgetConfig:
     """What the run may take besides Gaussians, whose cap is the density control's `max_gaussians`.
 
     Args:
-        max_memory: most memory of the device, for instance 2GiB, or bytes; empty: no limit.
-        time: of training to end after, for instance 20s or 2m, or seconds; empty: `train.iterations` decide.
+        max_memory: most memory of the device, for instance 2GiB or a number of bytes; empty: no limit.
+        time: time of training to end after, for instance 2m or a number of seconds; empty: `train.iterations` decide.
     """
 
     max_memory: str | int = ""
